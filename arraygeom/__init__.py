@@ -1,6 +1,7 @@
 """Differentiable geometry of rigs of N cameras of different kinds.
 
-Cameras, rigs, two-view geometry and receptive fields as tensor operations; see conventions.md.
+Cameras, rigs, two-view geometry and receptive fields as tensor operations; see conventions.md (installed by
+itself, the description of the distribution).
 """
 
 from collections.abc import Callable

@@ -188,6 +188,10 @@ class LensView(View):
     def _lens_batch(self) -> torch.Size:
         return self.distortion.batch_shape if self.distortion is not None else torch.Size()
 
+    def _normalised(self, x: Tensor) -> Tensor:
+        """Map pixels to points of the image plane, which the lens takes to rays."""
+        return map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
+
     def project_local(self, X: Real[Tensor, "*n 3"]) -> Projected:
         """Compute the projections of points (*n, 3) in the camera's frame."""
         X = floating(X)
@@ -205,14 +209,14 @@ class LensView(View):
             ValueError: for pixels without the axes of a batched K: wanted (*b, ..., 2).
             RuntimeError: for pixels without those of a lens, where K has none.
         """
-        normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
+        normalised = self._normalised(x)
         if self.distortion is None:
             return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
         return self.distortion.unproject(normalised)
 
     def ray_origins(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
         """Return the start of each pixel's ray in the camera's frame, metres: 0 if the camera is central."""
-        normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
+        normalised = self._normalised(x)
         if self.distortion is None:
             return torch.zeros_like(to_homogeneous(normalised))
         return self.distortion.origins(normalised)
@@ -284,7 +288,7 @@ class LensView(View):
         """Map pixels to normalised points, through f, and back to pixels."""
         if self.distortion is None:
             return super().undistort(x)
-        normalised, valid = f(self.distortion, map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x))
+        normalised, valid = f(self.distortion, self._normalised(x))
         return map_homogeneous(self.K[..., :2, :], normalised), valid
 
 

@@ -242,6 +242,16 @@ def check_tensors(last: tuple[int, ...], **values: Any) -> None:
             raise ValueError(f"{name} has shape {tuple(value.shape)}; wanted (..., {_shape(last)})")
 
 
+def check_plane(what: str, plane: Tensor, hw: HW) -> None:
+    """Check that images or maps (\\*b, h, w) have their camera's size; `what` names them in the message.
+
+    Raises:
+        ValueError: if they have not.
+    """
+    if tuple(plane.shape[-2:]) != tuple(hw):
+        raise ValueError(f"{what} is {tuple(plane.shape[-2:])}, its camera {tuple(hw)}: resize one")
+
+
 def check_field(field: Any) -> None:
     """Check that a receptive field can be called and is not a class.
 

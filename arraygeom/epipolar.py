@@ -68,9 +68,10 @@ def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float
         ValueError: for pixels without the axes of a batched F: wanted (*b, ..., 2).
     """
     size = F.abs().amax((-2, -1), keepdim=True)
-    line = map_homogeneous(F / torch.where(size > 0, size, 1.0), x)
+    F = F / torch.where(size > 0, size, 1.0)
+    line = map_homogeneous(F, x)
     squared = line[..., 0].square() + line[..., 1].square()
-    across = (F / torch.where(size > 0, size, 1.0))[..., :2, :].abs().amax(-2, keepdim=True)
+    across = F[..., :2, :].abs().amax(-2, keepdim=True)
     rounding = (
         4 * torch.finfo(line.dtype).eps * map_homogeneous(across.detach(), floating(x).detach().abs())[..., 0]
     )

@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from .camera import Camera, Projected
+from .checks import check_plane
 from .epipolar import beside
 from .pair import Pair
-from .pixels import HW, floating, pixel_grid
+from .pixels import floating, pixel_grid
 from .pose import Pose
 from .rig import Rig
 from .sampling import Interpolation, Sampled, sample
@@ -87,7 +88,7 @@ def warp(
         NotImplementedError: as `sample`.
     """
     for what, plane, view in (("image", image, pair.beta), ("depth", depth, pair.alpha)):
-        _check_size(f"the {what} given", plane, view.hw)
+        check_plane(f"the {what} given", plane, view.hw)
     projected = _in_beta(pair, depth)
     batch = max(len(image), len(projected.x))
     values, inside = sample(image.expand(batch, *image.shape[1:]), projected.x, interpolation=interpolation)
@@ -112,11 +113,6 @@ def plane_sweep(pair: Pair, image: Float[Tensor, "b c h w"], depths: Float[Tenso
     planes = depths[:, None, None, None].expand(-1, len(image), *pair.alpha.hw)
     swept = [warp(pair, image, plane) for plane in planes]
     return Sampled(torch.stack([s.values for s in swept], 2), torch.stack([s.valid for s in swept], 1))
-
-
-def _check_size(what: str, plane: Tensor, hw: HW) -> None:
-    if tuple(plane.shape[-2:]) != tuple(hw):
-        raise ValueError(f"{what} is {tuple(plane.shape[-2:])}, its camera {tuple(hw)}: resize one")
 
 
 def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
@@ -180,7 +176,7 @@ def consistent_depth(
     if rig.require(alpha) not in depths:
         raise ValueError(f"there is no depth map of '{alpha}', only of {', '.join(depths)}")
     for name, depth in depths.items():
-        _check_size(f"the depth map of '{name}'", depth, rig[name].hw)
+        check_plane(f"the depth map of '{name}'", depth, rig[name].hw)
     alpha_depth = floating(depths[alpha])
     x = pixel_grid(rig[alpha].hw, dtype=alpha_depth.dtype, device=alpha_depth.device)
     total, count = alpha_depth, torch.ones_like(alpha_depth)

@@ -157,6 +157,12 @@ def coarse_grid(hw: HW, spacing: int = 16) -> Float[Tensor, "h w 2"]:
     return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
 
 
+def safe_sqrt(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Compute square roots whose gradient at 0 is 0; 0 for numbers below 0, and for NaN."""
+    positive = x > 0
+    return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)
+
+
 def to_homogeneous(x: Float[Tensor, "*n d"]) -> Float[Tensor, "*n d+1"]:
     """Append a coordinate of 1."""
     return torch.nn.functional.pad(x, (0, 1), value=1.0)

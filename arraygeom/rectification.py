@@ -126,9 +126,7 @@ def middle_intrinsics(
     rays = [_middle_ray(camera, R) for camera, R in zip(cameras, rotations)]
     normalised = torch.stack([ray[:2] / ray[2] for ray in rays])
     centre = intrinsics(1.0, hw).to(focal)[:2, 2] - focal * normalised.mean(0)
-    return torch.cat(
-        [torch.cat([focal * torch.eye(2).to(focal), centre[:, None]], 1), focal.new_tensor([[0, 0, 1.0]])]
-    )
+    return intrinsics(focal, hw, centre).to(focal)
 
 
 NEAREST_COSINE = 0.1

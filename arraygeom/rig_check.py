@@ -13,9 +13,9 @@ from .camera import Camera, LensView, View
 from .checks import derived
 from .distortion import BROWN_CONRADY, Distortion
 from .fields.default import recorded_field
-from .lens_fit import LensKey, coverage, once_a_lens
+from .lens_coverage import LensKey, coverage, normalised, once_a_lens
 from .pair import Pair
-from .pixels import HW, coarse_grid, map_homogeneous
+from .pixels import HW, coarse_grid
 from .rig import Rig
 from .runtime.text import length_unit
 
@@ -214,7 +214,7 @@ def _round_trip(camera: LensView) -> tuple[float, bool]:
     """Largest error in pixels of projecting the rays of pixels back, and whether all of them have rays."""
     lens = camera.distortion
     assert lens is not None
-    points = map_homogeneous(torch.linalg.inv(camera.K)[..., :2, :], _grid(camera).to(camera.K))
+    points = normalised(camera, _grid(camera).to(camera.K))
     directions, has_ray = lens.unproject(points)
     back, has_image = lens.project(lens.origins(points) + directions)
     valid, off = has_ray & has_image, ((back - points) @ camera.K[:2, :2].mT).norm(dim=-1)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .batching import Batched
-from .pixels import HW, pixel_grid
+from .pixels import HW, pixel_grid, safe_sqrt
 from .runtime.text import share_text
 from .runtime.tracing import followed
 
@@ -61,8 +61,7 @@ class Segments(Batched):
         squared = x * x + y * y
         if not (squared.requires_grad or followed()):
             return squared.sqrt_()
-        positive = squared > 0
-        return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), 0.0)
+        return safe_sqrt(squared)
 
     def at(self, fraction: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2"]:
         """Return the point at a fraction of the way from start (0) to end (1)."""
@@ -94,8 +93,7 @@ class Segments(Batched):
     def distance(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
         """Compute the distance in pixels from points to their segments; infinite where not valid."""
         u = self.fraction(xy).clamp(0, 1)
-        squared = (xy - self.at(u)).square().sum(-1)
-        distance = torch.where(squared > 0, torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
+        distance = safe_sqrt((xy - self.at(u)).square().sum(-1))
         return torch.where(self.valid, distance, torch.inf)
 
     def mask(self, hw: HW, radius: float = 0.5) -> Bool[Tensor, "*n p"]:

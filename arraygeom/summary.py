@@ -12,7 +12,7 @@ from torch import Tensor
 from .camera import Camera, LensView
 from .distortion import Distortion
 from .fields import Curved, Epipolar, sampling_locations
-from .lens_fit import coverage, once_a_lens
+from .lens_coverage import coverage, once_a_lens
 from .pair import Pair
 from .pixels import coarse_grid, pixel_grid
 from .rig import Rig

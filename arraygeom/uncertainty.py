@@ -144,7 +144,7 @@ def bands(
     for depth in depths:
         C = product(product(axes, position_covariance(rig, covariance, alpha, beta, x, depth)), axes.mT)
         of_axes = C.diagonal(dim1=-2, dim2=-1)
-        worst = C.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).expand_as(of_axes)
+        worst = of_axes.sum(-1, keepdim=True).expand_as(of_axes)
         widths.append(factor * torch.where(length > SHORTEST, of_axes, worst).clamp(min=0).sqrt())
     along, across = torch.stack(widths, -1).unbind(-2)
     return BandWidths(across, along)

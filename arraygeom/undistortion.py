@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .camera import AnyLensView, Camera, LensView, View
+from .checks import check_plane
 from .pixels import HW, coarse_grid, map_homogeneous, pixel_coordinates, product
 from .runtime.chunks import chunked
 from .runtime.tracing import needs_numbers
@@ -163,8 +164,7 @@ def resampled(
     Raises:
         ValueError: for an image of another size than source's, a batch of views, and as `sample`.
     """
-    if tuple(image.shape[-2:]) != tuple(source.hw):
-        raise ValueError(f"the image is {tuple(image.shape[-2:])}, its camera {tuple(source.hw)}: resize one")
+    check_plane("the image", image, source.hw)
 
     def part(x: Tensor) -> Sampled:
         return sampled_between(

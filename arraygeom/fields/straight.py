@@ -16,7 +16,7 @@ from ..checks import check_above, check_bounds
 from ..epipolar import Track, epipolar_lines, segments_between, track
 from ..homography import apply_homography, fit_homography
 from ..pair import Depths, Link, Pair, depth_range
-from ..pixels import HW, coarse_grid, floating
+from ..pixels import HW, coarse_grid, floating, safe_sqrt
 from ..runtime.chunks import chunked
 from ..runtime.tracing import followed, needs_numbers
 from ..segments import Segments, clip_to_image
@@ -207,8 +207,7 @@ def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> 
     """
     squared = _squared_reach(pair, _widest(pair) if x is None else floating(x))
     squared = squared[..., None].flatten(len(pair.batch_shape))
-    largest = torch.nn.functional.pad(squared, (0, 1)).amax(-1)  # of no pixels 0
-    return torch.where(largest > 0, torch.where(largest > 0, largest, 1.0).sqrt(), 0.0)
+    return safe_sqrt(torch.nn.functional.pad(squared, (0, 1)).amax(-1))  # of no pixels 0
 
 
 def _squared_reach(pair: Pair, x: Tensor) -> Tensor:

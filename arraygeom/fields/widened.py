@@ -14,7 +14,7 @@ from ..camera import Camera
 from ..checks import check_above, check_field
 from ..multiview import world_rays
 from ..pair import Pair
-from ..pixels import HW, floating, pixel_grid, shift_matrix
+from ..pixels import HW, floating, pixel_grid, shift_matrix, within
 from ..rig import Rig
 from ..sampling import sample
 from ..segments import Positions, Segments, clip_to_image, sample_fractions
@@ -77,9 +77,7 @@ class Moved:
     def points(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
         """Return the positions in alpha of alpha's pixels when beta records."""
         x = floating(x)
-        h, w = self.displacement.shape[-2:]
-        inside = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
-        step = sample(self.displacement[None].to(x), inside.reshape(1, -1, 2)).values[0]
+        step = sample(self.displacement[None].to(x), x.reshape(1, -1, 2), extended=True).values[0]
         return x + step.mT.reshape(x.shape)
 
 
@@ -226,8 +224,7 @@ class Widened:
         steps = _between(across[..., :1], across[..., 1:], p.xy)[..., None] * left
         xy = p.xy[..., None, :, :] + rows[:, None, None] * steps[..., None, :, :]
         xy = xy.flatten(-3, -2)
-        inside = ((xy >= -0.5) & (xy <= xy.new_tensor([hw[1] - 0.5, hw[0] - 0.5]))).all(-1)
-        mask = inside & p.mask[..., None, :].expand(*p.mask.shape[:-1], len(rows), -1).flatten(-2, -1)
+        mask = within(xy, hw) & p.mask[..., None, :].expand(*p.mask.shape[:-1], len(rows), -1).flatten(-2, -1)
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from ..camera import Camera
 from ..distortion import BROWN_CONRADY
@@ -91,11 +90,6 @@ def brown_conrady(name: str, lens: LensModel | None, *, at_most: int) -> list[fl
     return c[:at_most]
 
 
-def pose_rows(R: Tensor, t: Tensor) -> list[list[float]]:
-    """Return the 4 x 4 matrix of a pose, row by row."""
-    return [[*row, x] for row, x in zip(R.tolist(), t.tolist())] + [[0.0, 0.0, 0.0, 1.0]]
-
-
 def at_origin(pose: Pose) -> bool:
     """Return True if a camera's frame is the world's, exactly."""
-    return pose_rows(pose.R, pose.t) == torch.eye(4).tolist()
+    return pose.matrix.tolist() == torch.eye(4).tolist()

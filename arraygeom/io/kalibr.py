@@ -25,7 +25,7 @@ from ..pose import Pose
 from ..rig import Rig
 from ..runtime.safe_yaml import dump_yaml
 from ..sensor import Sensor
-from .export import at_origin, brown_conrady, calibrated, focal_and_centre, pose_rows
+from .export import at_origin, brown_conrady, calibrated, focal_and_centre
 from .source import LENS_NAME, Entry, RigSource, decoded
 
 MODELS: dict[str, tuple[str | None, int, tuple[str, ...]]] = {
@@ -102,10 +102,9 @@ def write(rig: Rig) -> str:
         entry = _entry(name, camera)
         pose = camera.cam_from_world
         if before is not None:
-            relative = pose @ before.inverse()
-            entry["T_cn_cnm1"] = pose_rows(relative.R, relative.t)
+            entry["T_cn_cnm1"] = (pose @ before.inverse()).matrix.tolist()
         if has_imu:
-            entry["T_cam_imu"] = pose_rows(pose.R, pose.t)
+            entry["T_cam_imu"] = pose.matrix.tolist()
         if camera.sensor.time_offset:
             entry["timeshift_cam_imu"] = camera.sensor.time_offset
         document[f"cam{i}"], before = entry, pose

@@ -22,7 +22,7 @@ from ..camera import Camera
 from ..distortion import KANNALA_BRANDT, Distortion
 from ..pose import Pose
 from ..rig import Rig
-from .export import brown_conrady, calibrated, focal_and_centre, pose_rows
+from .export import brown_conrady, calibrated, focal_and_centre
 from .source import Entry, RigSource
 
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
@@ -124,4 +124,4 @@ def _frame(name: str, camera: Camera) -> dict[str, Any]:
     else:
         names = ("k1", "k2", "p1", "p2", "k3")
         fields |= {"camera_model": "OPENCV"} | dict(zip(names, brown_conrady(name, lens, at_most=5)))
-    return fields | {"transform_matrix": pose_rows(world_from_gl.R, world_from_gl.t)}
+    return fields | {"transform_matrix": world_from_gl.matrix.tolist()}

@@ -211,17 +211,6 @@ class RigSource:
         """
         return self._parsed("JSON", load_json, self.text())
 
-    def toml(self) -> Entry:
-        """Parse the file as a TOML document that is not empty.
-
-        Returns:
-            The entry of the whole document, whose value is a mapping.
-
-        Raises:
-            RigFileError: for any other file.
-        """
-        return self._parsed("TOML", tomllib.loads, self.text())
-
     def yaml(self, text: str | None = None) -> Entry:
         """Parse the file as a YAML mapping that is not empty and has no repeated keys.
 
@@ -263,8 +252,10 @@ class RigSource:
         """
         text = self.text(LARGEST_TEXT)
         first = text.lstrip()[0]
-        if first == "{" or self.path.suffix == ".toml":
-            return self.json() if first == "{" else self.toml()
+        if first == "{":
+            return self.json()
+        if self.path.suffix == ".toml":
+            return self._parsed("TOML", tomllib.loads, text)
         if first == "<":
             return self.at(_value_of_xml(self.at(self.xml()))).mapping()
         text = LARGE_DATA.sub("[]", re.sub(r"^%YAML.*|!!opencv[\w-]+", "", text, flags=re.M))

@@ -104,36 +104,6 @@ def capture_of(path: Path) -> list[Path]:
     return [p for p in beside if _states_camera(image_tags(p))] if stem else [path]
 
 
-def by_capture(paths: Sequence[Path]) -> dict[str, list[Path]]:
-    """Group the images of several captures by the names of their bands (`named_by_band`).
-
-    Captures with other ends of names than the largest are left out, with a RigFileWarning.
-
-    Args:
-        paths: image files, in any order; names in a capture differ after the last "_".
-
-    Returns:
-        Files of whole captures by band, in the captures' order; empty for a single whole capture, a single
-        band, and if the largest capture's tags do not state their cameras.
-
-    Raises:
-        OSError: for a file that cannot be opened.
-        ImportError: without Pillow.
-    """
-    captures: dict[tuple[Path, str], dict[str, Path]] = {}
-    for path in paths:
-        stem, _, end = path.stem.rpartition("_")
-        captures.setdefault((path.parent, stem), {})[end] = path
-    most = max(captures.values(), key=len, default={})
-    whole = [capture for capture in captures.values() if capture.keys() == most.keys()]
-    if len(most) < 2 or len(whole) < 2 or not states_cameras(list(most.values())):
-        return {}
-    if left_out := len(paths) - len(whole) * len(most):
-        RigSource(paths[0].parent).warn(f"{left_out} images are left out, whose captures lack a band")
-    named = {name: path.stem.rpartition("_")[2] for name, path in named_by_band(list(most.values())).items()}
-    return {name: [capture[end] for capture in whole] for name, end in named.items()}
-
-
 def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
     """Name images by their bands, as their tags state them.
 
@@ -161,10 +131,7 @@ def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
 
 def states_cameras(paths: Sequence[Path]) -> bool:
     """Return True if the tags of every image state its camera; False for no images."""
-    return bool(paths) and all(
-        path.suffix.lower() in SUFFIXES and path.is_file() and _states_camera(image_tags(path))
-        for path in paths
-    )
+    return bool(paths) and all(recognises(path, "") for path in paths)
 
 
 def rig_of_images(files: Mapping[str, Path]) -> Rig:

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..pixels import safe_sqrt
 from ..roots import first_root, invert_increasing
 from .common import MARGIN, angle_over_radius, cosine_and_sinc, finite_points
 from .model import CameraModel, beside_points
@@ -60,7 +61,7 @@ class PolynomialFisheye(CameraModel, name="polynomial-fisheye"):
         xy, finite = finite_points(xy)
         squared = xy.square().sum(-1)
         off = squared > 0
-        radius = torch.where(off, torch.where(off, squared, 1.0).sqrt(), 0.0)
+        radius = safe_sqrt(squared)
         with torch.no_grad():
             limit = beside_points(self._limit(), xy)
             outermost = limit * self._radius_over_angle(limit)[0]
@@ -127,7 +128,7 @@ class Equirectangular(CameraModel, name="equirectangular"):
         x, y, z = X.unbind(-1)
         squared = x.square() + z.square()
         off = squared > 0
-        level = torch.where(off, torch.where(off, squared, 1.0).sqrt(), 0.0)
+        level = safe_sqrt(squared)
         longitude = torch.atan2(torch.where(off, x, 0.0), torch.where(off, z, 1.0))
         valid = finite & (off | (y != 0))
         return torch.stack([longitude, torch.atan2(y, torch.where(valid, level, 1.0))], -1), valid

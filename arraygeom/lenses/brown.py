@@ -12,7 +12,7 @@ from torch import Tensor
 from ..pixels import broadcast_shapes, product, to_homogeneous
 from ..roots import first_root, invert_increasing, keeps_orientation, newton_step, solve_in_plane
 from ..runtime.tracing import traced
-from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, once, polynomial_product
+from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, once, polynomial_product, within_limit
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,7 @@ def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
         and ahead of a tilted sensor. Points beyond the limit are moved back to it first; NaN stays NaN.
     """
     lens, limit = Brown.named(c), once(brown_limit, c).to(xy)
-    squared = xy.square().sum(-1)
-    inside = squared < limit
-    pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, squared.clamp(min=TINY))).sqrt())
+    inside, pull = within_limit(xy.square().sum(-1), limit)
     planar, jacobian = _brown_planar(lens, xy * pull[..., None])
     tilted, ahead = _apply(_tilt_matrix(lens), planar)
     return tilted, inside & keeps_orientation(jacobian) & ahead
@@ -82,14 +80,12 @@ def brown_derivatives(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         raise ValueError(f"{len(c)} coefficients: a tilt has no derivatives in closed form")
     lens, limit = Brown.named(c[None]), once(brown_limit, c[None]).to(xy)
     squared = xy.square().sum(-1)
-    inside = squared < limit
-    outside = torch.where(inside, 1.0, squared.clamp(min=TINY))
-    pull = torch.where(inside, 1.0, (limit / outside).sqrt())
+    inside, pull = within_limit(squared, limit)
     pulled = xy * pull[:, None]
     planar, jacobian = _brown_planar(lens, pulled)
     along = torch.where(inside[:, None], 0.0, xy)
     moved = pull[:, None, None] * (
-        torch.eye(2).to(xy) - along[:, :, None] * (along / outside[:, None])[:, None]
+        torch.eye(2).to(xy) - along[:, :, None] * (along / squared.clamp(min=TINY)[:, None])[:, None]
     )
     by_point = torch.stack(jacobian, -1).reshape(-1, 2, 2) @ moved
     x, y = pulled.unbind(-1)

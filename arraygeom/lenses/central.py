@@ -14,10 +14,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..pixels import safe_sqrt
 from ..roots import first_root, invert_increasing
 from ..runtime.tracing import traced
 from .brown import brown_distort, brown_undistort
-from .common import MARGIN, TINY, WIDEST, angle_over_radius, cosine_and_sinc, unit
+from .common import MARGIN, TINY, WIDEST, angle_over_radius, cosine_and_sinc, unit, within_limit
 
 DOUBLE_SPHERE = "double-sphere"
 EXTENDED_UNIFIED = "extended-unified"
@@ -97,9 +98,7 @@ def central_unproject(model: str, c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tens
         xy_d, within = brown_undistort(planar, xy_d)
         valid = valid & within
     limit, _, _ = (v.to(xy_d) for v in _border(kind, c))
-    u = xy_d.square().sum(-1)
-    inside = u < limit
-    pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, u.clamp(min=TINY))).sqrt())
+    inside, pull = within_limit(xy_d.square().sum(-1), limit)
     return unit(kind.unproject(c, xy_d * pull[..., None])), valid & inside
 
 
@@ -214,15 +213,13 @@ def _along(c: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _scaramuzza_inverse(c: Tensor, xy: Tensor) -> Tensor:
-    u = xy.square().sum(-1)
-    r = torch.where(u > 0, torch.where(u > 0, u, 1.0).sqrt(), 0.0)
+    r = safe_sqrt(xy.square().sum(-1))
     return torch.cat([xy, _along(c, r)[0][..., None]], -1)
 
 
 def _scaramuzza(c: Tensor, X: Tensor) -> Tensor:
     """Solve s z = 1 + b2 (s R)^2 + ... for s, the radius over R = |(X, Y)|: smooth on the axis too."""
-    u, z = X[..., :2].square().sum(-1), X[..., 2]
-    R = torch.where(u > 0, torch.where(u > 0, u, 1.0).sqrt(), 0.0)
+    R, z = safe_sqrt(X[..., :2].square().sum(-1)), X[..., 2]
     angle = torch.atan2(R, z).detach()
     start = _traced_scaramuzza_radius if torch.compiler.is_compiling() else _scaramuzza_radius
     r = start(c.detach(), angle)

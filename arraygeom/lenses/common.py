@@ -57,6 +57,18 @@ def cosine_and_sinc(v: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(near, cosine, theta.cos()), torch.where(near, sinc, theta.sin() / theta)
 
 
+def within_limit(squared: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
+    """Compare squared radii (*n) with limits that broadcast to them.
+
+    Returns:
+        True (*n) below the limit, and the factor (*n) that moves points in to it, 1 for those below.
+    """
+    inside = squared < limit
+    return inside, torch.where(
+        inside, 1.0, (limit / torch.where(inside, 1.0, squared.clamp(min=TINY))).sqrt()
+    )
+
+
 def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Tensor]:
     """Multiply two polynomials, given by their coefficients from the constant up."""
     terms: list[Tensor] = [torch.zeros_like(a[0])] * (len(a) + len(b) - 1)

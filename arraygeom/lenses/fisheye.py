@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..roots import first_root, invert_increasing
-from .common import MARGIN, SOLVED, TINY, angle_over_radius, cosine_and_sinc, once, unit
+from .common import MARGIN, SOLVED, angle_over_radius, cosine_and_sinc, once, unit, within_limit
 
 
 def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
@@ -27,8 +27,7 @@ def fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
     ratio = angle_over_radius(u, z)
     v = u * ratio.square()
     limit = once(fisheye_limit, c).to(v)
-    inside = v < limit
-    pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, v.clamp(min=TINY))).sqrt())
+    inside, pull = within_limit(v, limit)
     p, _ = _fisheye_factor(c, torch.where(inside, v, limit))
     return xy * (ratio * pull * p)[..., None], inside & ((u > 0) | (z > 0))
 
@@ -48,8 +47,7 @@ def fisheye_unproject(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     limit = once(fisheye_limit, c).to(xy_d)
     u_d = xy_d.square().sum(-1)
     outermost = limit * _fisheye_factor(c, limit)[0].square()
-    inside = u_d < outermost
-    pull = torch.where(inside, 1.0, (outermost / torch.where(inside, 1.0, u_d.clamp(min=TINY))).sqrt())
+    inside, pull = within_limit(u_d, outermost)
     xy_d = xy_d * pull[..., None]
     u_d = torch.where(inside, u_d, outermost)
     start = _traced_fisheye_start if torch.compiler.is_compiling() else _fisheye_start

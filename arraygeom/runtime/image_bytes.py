@@ -24,9 +24,8 @@ ANIMATION = (b"acTL", b"fcTL", b"fdAT")
 """Chunks of a PNG file next to those of its first image."""
 SEPARATE = 2
 """TIFF PlanarConfiguration for one plane after the other."""
-GREY_TIFF = MINISWHITE, _MINISBLACK = 0, 1
-"""Values of TIFF PhotometricInterpretation."""
 YCBCR = 6
+"""Value of TIFF PhotometricInterpretation."""
 DEFLATE, PACKBITS, LZW, JPEG_IN_TIFF = (8, 32946), 32773, 5, 7
 """Values of TIFF Compression."""
 REDUCED, MASK = 1, 4
@@ -111,7 +110,7 @@ def _pnm(content: bytes) -> ImageHeader | None:
 
 def _tiff(content: bytes) -> ImageHeader | None:
     several = False
-    with _quiet_tiff(content) as file:
+    with quiet_tiff(content) as file:
         page = file.pages.first
         hw = int(page.imagelength), int(page.imagewidth)
         with suppress(*DAMAGED):
@@ -139,41 +138,6 @@ def _exif_orientation(exif: bytes) -> int:
 
 def _known(orientation: object) -> int:
     return int(orientation) if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
-
-
-def stored_values(content: bytes, header: ImageHeader) -> Any:
-    """Decode an image file's values as the file states them, not turned by an orientation tag.
-
-    Corrected are OpenCV's turning of TIFF files, its loss of bands that are no colours, mixed planes beyond 8
-    bits, white taken for black, values of 9 to 15 bits shifted up, and text PNM files scaled to 255.
-
-    Args:
-        content: the file's bytes.
-        header: their `image_header`; a TIFF file has 1, 3 or 4 bands (not checked).
-
-    Returns:
-        Values (h, w), or (h, w, channels) with blue first and alpha last, type as stored, those of 1 to
-        4 bits scaled to 255; colours of 8-bit TIFF files with alpha are times that. None for a damaged file,
-        and one that OpenCV cannot decode.
-    """
-    page, original = header.page, content
-    if page is not None and header.orientation != 1:
-        tag, changed = page.tags[ORIENTATION], bytearray(content)
-        struct.pack_into(page.parent.byteorder + tag.dataformat, changed, tag.valueoffset, 1)
-        content = bytes(changed)
-    values = decoded(content)
-    if page is not None and values is not None:
-        bands, grey = page.samplesperpixel, page.photometric in GREY_TIFF
-        if bands > 1 and (grey or (values.dtype != np.uint8 and page.planarconfig == SEPARATE)):
-            colours = _tiff_colours(original)
-            values = None if colours is None else colours[..., [2, 1, 0, 3][:bands]]
-        elif page.photometric == MINISWHITE and values.dtype == np.uint16:
-            values = 65535 - values
-        if header.white and values is not None and values.dtype == np.uint16:
-            values = values >> (16 - header.bits)
-    if content[:2] in PNM_OF_TEXT and header.white and values is not None and values.dtype == np.uint8:
-        values = ((values.astype(np.uint16) * header.white + 254) // 255).astype(np.uint8)
-    return values
 
 
 def decoded(content: bytes, flags: int = UNCHANGED) -> Any:
@@ -239,19 +203,13 @@ def _is_undamaged(content: bytes, chunk: tuple[bytes, int, int]) -> bool:
     return kind[:1].islower() or content[end - 4 : end] == found.to_bytes(4, "big")
 
 
-def _tiff_colours(content: bytes) -> Any:
-    """Values (h, w, c) of a TIFF file's first image by tifffile; None if damaged, or compressed otherwise."""
-    try:
-        with _quiet_tiff(content) as file:
-            page = file.pages.first
-            values = page.asarray()
-    except (*DAMAGED, zlib.error):
-        return None
-    return values.transpose(1, 2, 0) if page.planarconfig == SEPARATE else values
-
-
 @contextmanager
-def _quiet_tiff(content: bytes) -> Iterator[Any]:
+def quiet_tiff(content: bytes) -> Iterator[Any]:
+    """Context manager of a TIFF file's bytes as tifffile's `TiffFile`, without its log messages.
+
+    Raises:
+        Exception: one of `DAMAGED`, for a damaged file.
+    """
     from tifffile import TiffFile, logger
 
     log = logger()
@@ -266,7 +224,7 @@ def _quiet_tiff(content: bytes) -> Iterator[Any]:
 def _is_whole(content: bytes) -> bool:
     """True if all strips or tiles of a TIFF file's first image lie within the file and decompress."""
     try:
-        with _quiet_tiff(content) as file:
+        with quiet_tiff(content) as file:
             page = file.pages.first
     except DAMAGED:
         return False

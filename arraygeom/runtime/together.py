@@ -87,19 +87,17 @@ def write_together(
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def write_listed(path: Path, text: str, *, given: bool = False) -> None:
+def write_listed(path: Path, text: str) -> None:
     """Write one text file as a group of its own name, as `write_together` does.
 
     Args:
         path: file to write; missing folders are made.
         text: content, written as UTF-8.
-        given: True if the user chose the name: an unlisted or changed file of that name is then replaced.
 
     Raises:
-        FileExistsError, IsADirectoryError, OSError: as `write_together`.
+        FileExistsError, OSError: as `write_together`.
     """
-    chosen = (path.name,) if given else ()
-    with write_together(path.parent, group=path.name, last=path.name, given=chosen) as folder:
+    with write_together(path.parent, group=path.name, last=path.name) as folder:
         write_text(folder / path.name, text)
 
 

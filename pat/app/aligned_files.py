@@ -16,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 
 from arraygeom.runtime.atomic import write_text
-from arraygeom.runtime.file_names import file_names
 from arraygeom.runtime.together import refuse_others, write_together
 
 from ..fusion.align import Aligned
@@ -24,6 +23,7 @@ from ..fusion.views import FilesOfCameras
 from ..media.images import read_recorded, recorded_bands, write_image
 from ..media.raw import demosaiced
 from ..media.tags import RecordedTags, recorded_tags
+from ..support.file_names import file_names
 from .results import with_links
 
 PositionFormat = Literal["npy", "tif", "none"]

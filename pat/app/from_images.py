@@ -20,7 +20,7 @@ from torch.linalg import LinAlgError
 from torch.nn.functional import interpolate
 
 from arraygeom import LensView, Link, Rig, Sensor, View, apply_homography, resize_matrix
-from arraygeom.io.point_matches import read_matches
+from arraygeom.io.source import RigSource
 from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.pixels import HW
 from arraygeom.runtime.progress import log_step, part, stage
@@ -41,6 +41,7 @@ from ..media.tags import focal_length
 from ..media.video import read_video
 from ..networks.weights import load_weights
 from .dense_matches import MatchedDepth, matched_depth
+from .point_matches import read_matches
 
 LOG = logging.getLogger(__name__)
 
@@ -238,6 +239,36 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
     return {f"camera{i}": path for i, path in enumerate(paths, 1)}
 
 
+def by_capture(paths: Sequence[Path]) -> dict[str, list[Path]]:
+    """Group the images of several captures by the names of their bands (`named_by_band`).
+
+    Captures with other ends of names than the largest are left out, with a RigFileWarning.
+
+    Args:
+        paths: image files, in any order; names in a capture differ after the last "_".
+
+    Returns:
+        Files of whole captures by band, in the captures' order; empty for a single whole capture, a single
+        band, and if the largest capture's tags do not state their cameras.
+
+    Raises:
+        OSError: for a file that cannot be opened.
+        ImportError: without Pillow.
+    """
+    captures: dict[tuple[Path, str], dict[str, Path]] = {}
+    for path in paths:
+        stem, _, end = path.stem.rpartition("_")
+        captures.setdefault((path.parent, stem), {})[end] = path
+    most = max(captures.values(), key=len, default={})
+    whole = [capture for capture in captures.values() if capture.keys() == most.keys()]
+    if len(most) < 2 or len(whole) < 2 or not states_cameras(list(most.values())):
+        return {}
+    if left_out := len(paths) - len(whole) * len(most):
+        RigSource(paths[0].parent).warn(f"{left_out} images are left out, whose captures lack a band")
+    named = {name: path.stem.rpartition("_")[2] for name, path in named_by_band(list(most.values())).items()}
+    return {name: [capture[end] for capture in whole] for name, end in named.items()}
+
+
 def video_frames(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, list[Path]], dict[str, float]]:
     """Write the frames of videos as PNG files into a folder.
 
@@ -313,7 +344,7 @@ def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple
     straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
     shown = {name: pixels_between(tagged[name], straight[name])[1][None].float() for name in images}
     lengths = {name: float(straight[name].K[0, 0]) for name in images}
-    finest = lengths[alpha] * min(MATCHED / max(images[alpha].shape[-2:]), 1.0)
+    finest = lengths[alpha] * matching_factor(images[alpha])
     factors = {name: min(finest / length, 1.0) for name, length in lengths.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
     masks = {name: scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
@@ -338,8 +369,7 @@ def _mapped_rig(
     for images in captures:
         rig = Rig({name: tagged[name] for name in images})
         straight, pinhole = without_lenses(rig, images)
-        factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in pinhole.items()}
-        reduced = {name: scaled(image, factors[name]) for name, image in pinhole.items()}
+        reduced = {name: scaled(image, matching_factor(image)) for name, image in pinhole.items()}
         sized = resized_rig(straight, reduced)
         try:
             if by_pair is None:
@@ -404,7 +434,7 @@ def found_rig(
     Raises:
         ValueError: if no image shows enough of what alpha shows, and as `rig_from_images`.
     """
-    factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
+    factors = {name: matching_factor(image) for name, image in images.items()}
     reduced = {name: scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
     if by_pair is not None:
@@ -564,6 +594,12 @@ def resized_rig(rig: Rig, images: Images) -> Rig:
 
 def _hw(image: Tensor) -> HW:
     return int(image.shape[-2]), int(image.shape[-1])
+
+
+def matching_factor(image: Float[Tensor, "c h w"]) -> float:
+    """Return the factor that reduces an image to the size at which features are matched (`MATCHED`): at most
+    1."""
+    return min(MATCHED / max(image.shape[-2:]), 1.0)
 
 
 def scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:

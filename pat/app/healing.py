@@ -21,7 +21,7 @@ from calib.images.self_calibration import depth_bounds
 from ..fusion.checks import LowConfidenceWarning
 from ..fusion.views import ViewFiles, check_exposures
 from ..support.settings import size
-from .from_images import MATCHED, resized_rig, scaled
+from .from_images import matching_factor, resized_rig, scaled
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def healed_rig(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Healed | N
         The refined rig; None for too few points, and unless held-out points then lie about as near to their
         lines as to those of an F fitted to them, far nearer than before, and most within the depth range.
     """
-    small = {name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in images.items()}
+    small = {name: scaled(image, matching_factor(image)) for name, image in images.items()}
     reduced = resized_rig(rig.replace(cameras={name: rig[name] for name in (alpha, *small)}), small)
     try:
         pairs = related(reduced, match_cameras(small, alpha=alpha))

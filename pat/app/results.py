@@ -23,7 +23,6 @@ from arraygeom.checks import check_above
 from arraygeom.io.native import write as rig_text
 from arraygeom.runtime.atomic import alone, write_text
 from arraygeom.runtime.chunks import chunked
-from arraygeom.runtime.file_names import file_names
 from arraygeom.runtime.text import ASSUMED
 from arraygeom.runtime.threads import in_parallel
 from arraygeom.runtime.together import LISTS, refuse_others, write_listed, write_together
@@ -34,6 +33,7 @@ from ..media.depth_maps import write_points
 from ..media.figures import colour_depth
 from ..media.images import write_image
 from ..media.raw import developed
+from ..support.file_names import file_names
 from ..support.memory import how_many_fit
 
 MOST = 65535

@@ -34,6 +34,7 @@ from arraygeom.runtime.extras import install_line
 from arraygeom.runtime.image_bytes import ImageHeader, image_header
 from arraygeom.runtime.warned import warn
 
+from .stored_values import GREY_TIFF, stored_values
 from .suffixes import RAW_SUFFIXES
 
 FEW_BITS = (8, 10, 12, 14)
@@ -145,10 +146,10 @@ def _planes(
     applied = _applied(header, orientation, label)
     _check_header(header.upright if applied > 1 else header.hw, hw, label)
     if (page := header.page) is not None:
-        bands, grey = page.samplesperpixel, page.photometric in image_bytes.GREY_TIFF
+        bands, grey = page.samplesperpixel, page.photometric in GREY_TIFF
         if bands not in (1, 3, 4) or (bands == 4 and grey):
             raise ValueError(f"{label}: has {bands} channels: {CHANNELS}")
-    values = image_bytes.stored_values(content, header)
+    values = stored_values(content, header)
     if values is None and page is not None and page.dtype is not None and page.dtype not in DECODED:
         raise ValueError(f"{label}: has {page.dtype} values: {KINDS}")
     if values is None:

@@ -46,7 +46,7 @@ def test_deep_nesting_is_one_line(text, tmp_path):
 def test_deep_nesting_of_toml_is_refused(tmp_path):
     (tmp_path / "a.toml").write_text("a = " + "[" * DEEP + "]" * DEEP)
     with pytest.raises(RigFileError, match="TOML"):
-        RigSource(tmp_path / "a.toml").toml()
+        RigSource(tmp_path / "a.toml").document()
 
 
 def test_a_matrix_that_claims_a_size_takes_no_memory(tmp_path):

@@ -76,7 +76,7 @@ from arraygeom import (
 )
 from arraygeom.fields import AroundMatches
 from arraygeom.fields.ray_depth import ray_depth
-from arraygeom.lens_fit import coverage
+from arraygeom.lens_coverage import coverage
 from arraygeom.robust import least_squares, robust_least_squares
 from arraygeom.viz import draw_matches, draw_residuals
 from arraygeom.wide_views import cube_faces, rectify_spherical

@@ -22,7 +22,7 @@ from calib.images.focal_length import fit_focal_length
 from calib.images.from_images import rig_from_images
 from calib.images.self_calibration import FOCAL_SHARE
 from pat.app.cli.parser import script
-from pat.app.from_images import MATCHED, resized_rig, scaled
+from pat.app.from_images import matching_factor, resized_rig, scaled
 from pat.lab.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.printed import DATA, print_tables, reproducible
 from tests.calib.real import RealPair, ball, bumblebee, hilti, kitti, lund, middlebury, named, syntim
@@ -57,9 +57,7 @@ def with_square_pixels(pair: RealPair) -> RealPair:
 
 
 def row(pair: RealPair) -> list[str]:
-    images = {
-        name: scaled(image, min(MATCHED / max(image.shape[-2:]), 1.0)) for name, image in pair.images.items()
-    }
+    images = {name: scaled(image, matching_factor(image)) for name, image in pair.images.items()}
     pair = with_square_pixels(RealPair(pair.name, resized_rig(pair.rig, images), images))
     alpha, beta = pair.images
     true, longest = float(_camera(pair, alpha).K[0, 0]), max(pair.images[alpha].shape[-2:])

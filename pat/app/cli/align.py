@@ -83,7 +83,7 @@ class Align(Around):
         options.writable(self.out, folder=True)
         check_apart(self.out, () if with_rig else filter(Path.is_dir, self.given))
         self.settings()
-        self._extras = options.some_of(self.extras, EXTRAS)
+        self._extras = options.extras_of(self.extras, EXTRAS)
         with self.judged():
             for frame in self._frames_with_rig(image) if with_rig else self._frames_without(flight):
                 self._align(frame)
@@ -94,9 +94,8 @@ class Align(Around):
         listed = all(path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES for path in self.given)
         if self.image or not (len(folders) == len(self.given) == 1 or (listed and len(self.given) > 2)):
             return {}
-        from arraygeom.io.xmp import by_capture
-
         from ..batch import find_images
+        from ..from_images import by_capture
 
         return by_capture(find_images(folders[0]) if folders else self.given)
 

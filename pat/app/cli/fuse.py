@@ -74,7 +74,7 @@ class Fuse(Around, Fusing):
             OSError: if files cannot be written.
             SystemExit: as `judged`.
         """
-        self._extras = options.some_of(self.extras, EXTRAS)
+        self._extras = options.extras_of(self.extras, EXTRAS)
         image, with_rig = self.named("fuse")
         options.device_of(self.device)
         with self.judged(), self.recordings(image, with_rig=with_rig) as frame:

@@ -347,7 +347,7 @@ def refuse_same(files: Mapping[str, Sequence[Path]]) -> None:
 def is_named(path: Path) -> bool:
     """Return True for a NAME=FILE in a path's place, whose FILE exists and which is no file itself."""
     _, _, file = f"{path}".partition("=")
-    return bool(file) and not path.exists() and (Path(file).exists() or any(c in file for c in "*?["))
+    return bool(file) and not path.exists() and (Path(file).exists() or options.is_pattern(file))
 
 
 def is_rig_file(path: Path) -> bool:
@@ -355,4 +355,4 @@ def is_rig_file(path: Path) -> bool:
     or a video."""
     path = Path(f"{path}".partition("=")[2]) if is_named(path) else path
     suffixes = IMAGE_SUFFIXES | VIDEO_SUFFIXES
-    return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())
+    return not (options.is_pattern(path.name) or path.suffix.lower() in suffixes or path.is_dir())

@@ -337,7 +337,8 @@ def _around_matches(
     """Field of each beta, around its matches with alpha if there are any. Raises as `_check_matches`."""
     from arraygeom import LensView
     from arraygeom.fields import AroundMatches
-    from arraygeom.io.point_matches import read_matches
+
+    from ..point_matches import read_matches
 
     fields = dict.fromkeys(rig.betas(alpha), field)
     for names, points in read_matches(path, files, {name: rig[name].hw for name in files}).items():

@@ -231,8 +231,8 @@ def load_rig(path: Path, depth: tuple[float, float] | None = None, *, or_image: 
 NO_IMAGE = "is no image: images end in .png, .tif, .jpg and the like"
 
 
-def some_of(text: str, names: Sequence[str], option: str = "--extras") -> set[str]:
-    """Parse names between commas, such as "page,points", as the value of an option.
+def extras_of(text: str, names: Sequence[str]) -> set[str]:
+    """Parse names between commas, such as "page,points", as the value of --extras.
 
     Returns:
         The names, a set.
@@ -242,8 +242,13 @@ def some_of(text: str, names: Sequence[str], option: str = "--extras") -> set[st
     """
     given = {*text.split(",")}
     if unknown := given - {*names}:
-        raise UsageError(option, f"some of {', '.join(names)}", min(unknown))
+        raise UsageError("--extras", f"some of {', '.join(names)}", min(unknown))
     return given
+
+
+def is_pattern(name: str) -> bool:
+    """Return True for a file's name with *, ? or [, by which files are searched for."""
+    return any(c in name for c in "*?[")
 
 
 def refuse_missing(path: Path, *, rig: bool) -> None:
@@ -256,7 +261,7 @@ def refuse_missing(path: Path, *, rig: bool) -> None:
     Raises:
         FileNotFoundError: if it does not.
     """
-    if path.exists() or (not rig and any(c in path.name for c in "*?[")):
+    if path.exists() or (not rig and is_pattern(path.name)):
         return
     _, _, file = str(path).partition("=")
     advice = "check the path"

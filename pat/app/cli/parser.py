@@ -132,7 +132,7 @@ def parse(
     return _changed(base, given) if given else base
 
 
-def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, prog: str = "") -> T:
+def script(kind: Callable[..., T], arguments: Sequence[str] | None = None) -> T:
     """Parse the command line of a stand-alone script, and end the process for a bad one.
 
     Arguments and result are as for `parse`.
@@ -141,7 +141,7 @@ def script(kind: Callable[..., T], arguments: Sequence[str] | None = None, *, pr
         SystemExit: with one line, status 1, where `parse` raises UsageError, and after `--help`.
     """
     try:
-        return parse(kind, arguments, prog=prog)
+        return parse(kind, arguments)
     except UsageError as error:
         sys.exit(f"{error}")
 

@@ -118,8 +118,9 @@ def given_matches(path: Path | None, texts: Sequence[str], images: Mapping[str, 
     """
     if path is None:
         return None
-    from arraygeom.io.point_matches import read_matches
     from calib.images.matches import PointMatches
+
+    from ..point_matches import read_matches
 
     files = options.files_by_name(texts)
     sizes = {name: (image.shape[1], image.shape[2]) for name, image in images.items()}
@@ -318,7 +319,8 @@ class Convert:
             OSError: if it cannot be written.
         """
         from arraygeom.io import read_rig, write_rig
-        from arraygeom.lens_fit import refit_rig
+
+        from ..lens_refit import refit_rig
 
         hw = None if self.size is None else (self.size[1], self.size[0])
         if hw is not None and min(hw) < 1:

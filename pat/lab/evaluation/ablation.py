@@ -58,14 +58,14 @@ from ...media.depth_maps import at_distance
 from ...media.figures import save_panels
 from ...networks.protocol import FusionNetwork
 from ...sensors import Clip, Noise, Quantise, record
-from ...support.metrics import bootstrap_interval, score
+from ...support.metrics import score
 from ..data.windows import reading, scene_folders
 from ..synthesis.layered import LayeredScenes
 from ..synthesis.photos import PhotoBank
 from ..synthesis.rendered import Rendered
 from ..synthesis.rig_distribution import RigDistribution
 from .rectified import rectified
-from .tables import grouped, markdown_table, write_csv
+from .tables import grouped, interval_cell, markdown_table, write_csv
 
 LOG = logging.getLogger(__name__)
 
@@ -472,13 +472,12 @@ def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[st
     off, near = zip(*((row.end_point_error, row.within_one) for row in served))
     gain, error, within = map(_mean, (gains, off, near))
     psnr, ssim = [row.psnr for row in served], [row.ssim for row in served]
-    interval = " ({:.2f} to {:.2f})".format(*bootstrap_interval(psnr)) if len(psnr) > 1 else ""
     groups = [[r.psnr for r in served if a <= r.ratio < b] for a, b in pairwise((0, *RATIOS, math.inf))]
     means = [f"{np.mean(g):.2f}" if g else "" for g in groups]
     note = "" if len(served) == len(rows) else f"{_scenes(len(rows) - len(served))} omitted"
     depth = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]
     gained = "" if math.isnan(gain) else f"{gain:+.2f}"
-    image = [f"{np.mean(psnr):.2f}{interval}", f"{np.mean(ssim):.4f}", gained]
+    image = [f"{np.mean(psnr):.2f}{interval_cell(psnr)}", f"{np.mean(ssim):.4f}", gained]
     return [*image, *means, *depth, note]
 
 

@@ -15,10 +15,10 @@ from rich.progress import track
 from torch import Tensor
 
 from ...media.images import write_image
-from ...support.metrics import bootstrap_interval, score
+from ...support.metrics import score
 from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair, folder_pairs, middlebury_pairs
 from .protocols import MonoColourTask, StereoMethod, StereoResult, enlarged, hw_of, mono_colour_task
-from .tables import grouped, markdown_table
+from .tables import grouped, interval_cell, markdown_table
 
 DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
     "kitti": folder_pairs,
@@ -172,8 +172,7 @@ def _table(rows: Sequence[StereoRow], printed: tuple[float, float] | None = None
 def _mean_cell(rows: Sequence[StereoRow]) -> str:
     """Mean PSNR with its 95% bootstrap interval, and mean SSIM."""
     psnr = [row.psnr for row in rows]
-    interval = " ({:.2f} to {:.2f})".format(*bootstrap_interval(psnr)) if len(psnr) > 1 else ""
-    return f"**{np.mean(psnr):.2f}**{interval} / **{np.mean([row.ssim for row in rows]):.4f}**"
+    return f"**{np.mean(psnr):.2f}**{interval_cell(psnr)} / **{np.mean([row.ssim for row in rows]):.4f}**"
 
 
 def depth_markdown(rows: Sequence[StereoRow]) -> str:

@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 
 from arraygeom.runtime.atomic import write_text
 
+from ...support.metrics import bootstrap_interval
+
 T = TypeVar("T")
 
 
@@ -53,6 +55,15 @@ def markdown_header(columns: Sequence[str], *, align: str = "lr") -> str:
 def markdown_row(cells: Iterable[object]) -> str:
     """Format one row of a Markdown table, without a newline. Cells with "|" are not escaped."""
     return f"| {' | '.join(map(str, cells))} |"
+
+
+def interval_cell(values: Sequence[float]) -> str:
+    """Format the 95% bootstrap interval of a mean, to stand behind it, as " (31.20 to 31.85)".
+
+    Returns:
+        The text, to two decimals; empty for fewer than two values.
+    """
+    return " ({:.2f} to {:.2f})".format(*bootstrap_interval(values)) if len(values) > 1 else ""
 
 
 def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -172,13 +172,21 @@ def depth_between(
     """
     inverse = torch.where(depth.isfinite(), 1 / depth, 0.0).to(x)
     layers = torch.stack([inverse, index.to(x), *(b.to(x) for b in _creases(inverse, uneven))])[None]
-    steps = x.new_tensor([[0, 0], [1, 0], [0, 1], [1, 1]]).reshape(4, *[1] * (x.ndim - 1), 2)
-    corners = sample(layers, (x.floor() + steps)[None], interpolation="nearest").values[0]
-    q, around, across, down = corners.unbind(0)
+    q, around, across, down = four_around(layers, x).unbind(0)
     flat = (across[0::2] * across[1::2] == 0).all(0) & (down[:2] * down[2:] == 0).all(0)
     clean = (around == around[:1]).all(0) & flat & ((q > 0) == (q[:1] > 0)).all(0)
     between, inside = sample(layers[:, :1], x[None])
     return 1 / between[0, 0], clean & inside[0]
+
+
+def four_around(layers: Float[Tensor, "1 c h w"], x: Float[Tensor, "*n 2"]) -> Float[Tensor, "c 4 *n"]:
+    """Sample the four pixels around positions (x, y): two above, two below, left before right.
+
+    Returns:
+        Values (c, 4, *n), 0 beyond the image.
+    """
+    steps = x.new_tensor([[0, 0], [1, 0], [0, 1], [1, 1]]).reshape(4, *[1] * (x.ndim - 1), 2)
+    return sample(layers, (x.floor() + steps)[None], interpolation="nearest").values[0]
 
 
 def _creases(inverse: Float[Tensor, "h w"], uneven: float) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from arraygeom import Camera, Pose, View, pixel_grid, sample
 from arraygeom.pixels import map_homogeneous
 
-from ..rendered import depth_between
+from ..rendered import depth_between, four_around
 
 WIDEST = math.radians(80)
 """Largest angle off axis, in radians, that a plane image covers."""
@@ -94,8 +94,7 @@ def _continued(inverse: Float[Tensor, "h1 w1"], x: Float[Tensor, "h2 w2 2"]) -> 
     layers = torch.stack([inverse, _gentlest(inverse, 1), _gentlest(inverse, 0)])
     q, across, down = sample(layers[None], x[None], interpolation="nearest").values[0]
     dx, dy = (x - (x + 0.5).floor()).unbind(-1)
-    steps = x.new_tensor([[0, 0], [1, 0], [0, 1], [1, 1]])[:, None, None]
-    around = sample(inverse[None, None], (x.floor() + steps)[None], interpolation="nearest").values[0, 0]
+    around = four_around(inverse[None, None], x)[0]
     return torch.clamp(q + across * dx + down * dy, around.amin(0), around.amax(0))
 
 

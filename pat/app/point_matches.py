@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..pixels import HW
-from .source import decoded
+from arraygeom.io.source import decoded
+from arraygeom.pixels import HW, within
 
 MAX_IMAGES = 2**31 - 1
 """Factor in COLMAP's number of a pair of images a < b: a * MAX_IMAGES + b (its documentation of the
@@ -63,7 +63,7 @@ def read_matches(path: str | Path, files: Mapping[str, str | Path], sizes: Mappi
     for names, points in matches.items():
         for name, x in zip(names, points):
             h, w = sizes[name]
-            outside = ~((x >= -0.5) & (x <= x.new_tensor([w, h]) - 0.5)).all(-1)
+            outside = ~within(x, (h, w))
             if outside.any():
                 raise ValueError(
                     f"{path}: {int(outside.sum())} of {len(x)} points are outside the image of '{name}', "

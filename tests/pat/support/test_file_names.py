@@ -5,7 +5,7 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arraygeom.runtime.file_names import LONGEST, file_names
+from pat.support.file_names import LONGEST, file_names
 
 ODD = ["../../evil", "/abs/path/x", "a/b", "a\\b", "a\0b", "a\nb", "\x1b[31m", "", ".", "..", ".lock", "CON"]
 ODD += ["nul.txt", "x" * 300, "é" * 60, "trailing.", "trailing ", " a", "a:b", "a*b?", '"', "\ud800", "Ⅷ / 8"]

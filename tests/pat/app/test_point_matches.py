@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom.io.point_matches import MAX_IMAGES, read_matches
+from pat.app.point_matches import MAX_IMAGES, read_matches
 
 FILES = {"mono": Path("photos/a.png"), "colour": Path("photos/b.png")}
 SIZES = {"mono": (60, 80), "colour": (50, 70)}
