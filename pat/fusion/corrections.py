@@ -23,6 +23,7 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import sample
 
+from ..matching.band_mix import Response, ResponseSpec, fit, given_response
 from ..matching.epipolar_offset import SETTINGS as ALIGNMENT
 from ..matching.epipolar_offset import Misalignment, fit_misalignment
 from ..matching.filters import blurred
@@ -32,7 +33,6 @@ from ..matching.matches import BetaMatches
 from ..matching.normalisation import SETTINGS as NORMALISATION
 from ..matching.normalisation import Normalisation, combined_bands, moments
 from ..matching.positions import enlarged, normals, reduced
-from ..matching.radiometry import Response, ResponseSpec, fit, given_response
 from ..matching.semi_global import CONSISTENT
 from ..networks.protocol import FusionNetwork
 from ..support.settings import size, tuned

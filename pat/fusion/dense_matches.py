@@ -16,11 +16,11 @@ from arraygeom.runtime.chunks import whole
 from arraygeom.runtime.threads import torch_in_one_thread
 from arraygeom.sampling import on_image
 
+from ..matching.band_mix import Response
 from ..matching.inputs import Inputs
 from ..matching.match import match
 from ..matching.matches import Matches
 from ..matching.positions import Extent, match_positions
-from ..matching.radiometry import Response
 from ..media.images import Images
 from ..networks.protocol import FusionOutput, JoinsBands, required
 from ..support.blocks import without_autocast

@@ -18,10 +18,10 @@ from arraygeom.runtime.threads import torch_in_one_thread
 from arraygeom.runtime.tracing import transformations
 from arraygeom.runtime.warned import warn
 
+from ..matching.band_mix import ResponseSpec, given_response
 from ..matching.inputs import Inputs
 from ..matching.match import Matcher, match
 from ..matching.matches import Matches
-from ..matching.radiometry import ResponseSpec, given_response
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..support.blocks import without_autocast

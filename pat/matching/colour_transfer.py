@@ -17,6 +17,7 @@ from arraygeom.runtime.chunks import chunked
 
 from ..media.colour import REC601, to_bytes
 from ..support.settings import size, tuned
+from .band_mix import SpectralMix
 from .examples import by_examples
 from .filters import LocalMoments, box_mean, numpy_of, smoothed
 from .inputs import Beta, Inputs
@@ -26,7 +27,6 @@ from .normalisation import SETTINGS as NORMALISATION
 from .normalisation import Moments, combined_bands, explained_share, moments
 from .positions import at_matches
 from .semi_global import DISPARITY_FILL
-from .spectral_mix import SpectralMix
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
 
+from .band_mix import SETTINGS as MIX
+from .band_mix import SpectralMix
 from .certainty import with_certainty
 from .choice import Choice, chosen
 from .colour_transfer import transferred
@@ -22,8 +24,6 @@ from .multiview import agreed, with_likeliest_colours
 from .normalisation import Comparison
 from .positions import FINE, at_matches, reduced
 from .semi_global import HalfSizeMatches, matched_at_half_size
-from .spectral_mix import SETTINGS as MIX
-from .spectral_mix import SpectralMix
 from .subpixel import following, matched_at_full_size
 
 LOG = logging.getLogger(__name__)

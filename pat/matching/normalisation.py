@@ -16,9 +16,9 @@ from torch.nn.functional import avg_pool2d
 
 from ..media.colour import luminance, to_bytes
 from ..support.settings import size
+from .band_mix import SpectralMix
 from .filters import blurred
 from .positions import FINE
-from .spectral_mix import SpectralMix
 
 LEAST_WEIGHT = 1e-6
 """Size: added to weights, so that there are moments where all are 0."""

@@ -6,9 +6,9 @@ from torch.nn.functional import interpolate
 
 from arraygeom import Pair, Rectified, View
 from arraygeom.fields.grid import FieldOnGrid
+from pat.matching.band_mix import SpectralMix
 from pat.matching.filters import box_mean
 from pat.matching.match import coarse_mix
-from pat.matching.spectral_mix import SpectralMix
 
 WEIGHTS = torch.tensor([0.3, 0.6, 0.1])
 

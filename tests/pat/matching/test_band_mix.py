@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pat import FuseSettings, fuse
-from pat.matching import radiometry
-from pat.matching.radiometry import SETTINGS, UNLIKE, Response, fit, stated_response
+from pat.matching import band_mix
+from pat.matching.band_mix import EXPLANATIONS, SETTINGS, Response, fit, stated_response
 from pat.media.colour import REC601, luminance
 from pat.networks.weights import load_weights
 from pat.support.metrics import score
@@ -78,7 +78,7 @@ def test_a_sensor_without_filters_is_preferred_to_weights_that_explain_alpha_har
     alpha = light * x.mean(0) + noise
     assert fit(x, alpha).weights.tolist() == [1 / 3] * 3
     with monkeypatch.context() as patched:
-        patched.setattr(radiometry, "UNLIKE", [kind for kind in UNLIKE if kind.weights[0] != 1 / 3])
+        patched.setattr(band_mix, "EXPLANATIONS", [one for one in EXPLANATIONS if one[0] == REC601 or one[1][0]])
         assert (fit(x, alpha).weights - 1 / 3).abs().max() > 0.01
     other = fit(x, combined(x[:, :, None], WEIGHTS)[0, :, 0] * light + noise).weights
     assert (other - torch.tensor(WEIGHTS)).abs().max() < 0.06
@@ -172,7 +172,7 @@ def test_leaves_lit_more_brightly_are_not_taken_for_a_sensor_of_green_alone(monk
     )
     alpha = luminance(x[:, None])[0, 0] * light[material] + 0.005 * torch.randn(4000, generator=g)
     assert fit(x, alpha).is_rec601
-    monkeypatch.setattr(radiometry, "SETTINGS", replace(SETTINGS, light=0.001))
+    monkeypatch.setattr(band_mix, "SETTINGS", replace(SETTINGS, light=0.001))
     assert fit(x, alpha).weights[1] > 0.65
 
 
@@ -185,7 +185,7 @@ def test_a_band_that_no_combination_explains_leaves_rec601(monkeypatch):
     x, alpha = colours[:, material] * shadow, (colours.mean(0) + other)[material] / 2 * shadow
     assert fit(x, alpha).is_rec601
     assert not fit(x, alpha).explains
-    monkeypatch.setattr(radiometry, "SETTINGS", replace(SETTINGS, explained=0.5))
+    monkeypatch.setattr(band_mix, "SETTINGS", replace(SETTINGS, explained=0.5))
     assert fit(x, alpha).explains
 
 
