@@ -1,8 +1,8 @@
 """Mix of beta's bands that alpha sees, by weighted least squares on matched points.
 
-A network compares alpha with one mix of beta's bands and keeps alpha as that mix of the result. A `Response` is
-the mix of red, green and blue as cameras form it: beta at another exposure, with another tone curve and
-vignetting, seen by a sensor of other weights. A `SpectralMix` is a linear mix of any bands, relative to the means
+A network compares alpha with one mix of beta's bands and keeps alpha as that mix of the result. A `Response`
+is the mix of red, green and blue as cameras form it: of beta at another exposure, with another tone curve and
+vignetting, by a sensor of other weights. A `SpectralMix` is a linear mix of any bands, relative to means
 around each pixel.
 """
 
@@ -57,7 +57,7 @@ class BandMixSettings:
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
     groups: int = size(256, "Groups of alike points; half or twice as many do as well")
     outlier: float = physics(2.385, "Deviations that count half: 95 % efficient if errors are normal")
-    steps: int = size(4, "Gauss-Newton steps of an explanation")
+    steps: int = size(3, "Gauss-Newton steps of an explanation")
     explained: float = tuned(
         0.8,
         "Share of alpha's variance that must be explained: of Middlebury's tune half at least .88 is, "
@@ -88,8 +88,8 @@ class Response(NamedTuple):
             Rec. 601's was kept; 1 if none was fitted.
         shading: coefficients of u, v, u^2, u v and v^2, the place in beta's width and height from its middle,
             in the logarithm of a gain that corrects beta's vignetting; empty without.
-        deviations: standard deviations of the three weights, and of the logarithms of gain and gamma, over all
-            explanations by their probability; 0 where none was fitted.
+        deviations: standard deviations of the three weights, and of the logarithms of gain and gamma, over
+            all explanations by their probability; 0 where none was fitted.
     """
 
     weights: Float[Tensor, "3"]
@@ -232,28 +232,29 @@ def fit(
             could explain anything: only gain and gamma are fitted, and `explained` is divided by it.
 
     Returns:
-        The response, on the CPU; Rec. 601's if that is likeliest, for fewer points than enough (`SETTINGS.points`)
-        (`explained` is 1 then), and where no mix of bands explains alpha (`explains` is False).
+        The response, on the CPU; Rec. 601's if that is likeliest, for too few points (`SETTINGS.points`;
+        `explained` is 1 then), and where no mix of bands explains alpha (`explains` is False).
 
     Raises:
         ValueError: for another `enough`.
     """
     if not 0 <= enough <= 1:
         raise ValueError(f"enough is {enough}: give a share of the matches wanted, 0 to 1")
+    most, fewest = SETTINGS.points
     place = torch.zeros_like(bands[:2].T) if where is None else where
-    planes = torch.cat([bands, alpha[None], place.T]).double().cpu()
+    planes = torch.cat([bands, alpha[None], place.T])[:, :: max(alpha.numel() // most, 1)].double().cpu()
     planes = planes[:, (planes[:4] > 0.02).all(0) & (planes[:4] < 0.98).all(0)]
-    if not enough or planes.shape[1] < SETTINGS.points[1]:
+    if not enough or planes.shape[1] < fewest:
         return Response.rec601()
-    planes = planes[:, :: -(-planes.shape[1] // SETTINGS.points[0])]
     groups = _Groups.from_points(planes[:3], planes[3], planes[4:])
     fits = [groups.fitted(*one) for one in EXPLANATIONS if where is not None or not one[1][-1]]
     best = max((one for one in fits if enough == 1 or one.is_exposure), key=lambda one: one.evidence)
     explained = min(max(one.explained for one in fits) / enough, 1.0)
     response = best.response() if explained >= SETTINGS.explained else Response.rec601()
     probability = torch.stack([one.evidence for one in fits]).softmax(0)
-    off = torch.stack([(one.numbers - best.numbers).square() + one.variances for one in fits])
-    return response._replace(explained=explained, deviations=tuple((probability @ off).sqrt().tolist()))
+    spread = torch.stack([(one.numbers - best.numbers).square() + one.variances for one in fits])
+    deviations = (probability @ spread).sqrt().tolist()
+    return response._replace(explained=explained, deviations=tuple(deviations[:5]))
 
 
 def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
@@ -270,38 +271,34 @@ EXPLANATIONS = tuple(
         (0.0, SETTINGS.vignetting),
     )
 )
-"""Weights, and the prior deviations of nine parameters, 0 where one is fixed at 0: changes of the weights along
-`HUES`, logarithms of gain and gamma, shading."""
+"""Weights, and the prior deviations, 0 where fixed, of nine parameters: changes of the weights along `HUES`,
+logarithms of gain and gamma, shading."""
 
 
 class _Fit(NamedTuple):
-    """Most probable parameters of an explanation.
+    """Most probable numbers of an explanation: three weights, logarithms of gain and gamma, shading.
 
     Attributes:
         evidence: logarithm of the explanation's probability, up to a constant.
-        widths: prior deviations of the parameters (9).
-        parameters: the parameters (9).
-        numbers: weights, and logarithms of gain and gamma (5).
-        variances: variances of these.
-        explained: share of alpha's variance that is explained.
+        numbers: the numbers.
+        variances: variances of the numbers.
+        explained: share of alpha's variance that they explain.
     """
 
     evidence: Float[Tensor, ""]
-    widths: Float[Tensor, "9"]
-    parameters: Float[Tensor, "9"]
-    numbers: Float[Tensor, "5"]
-    variances: Float[Tensor, "5"]
+    numbers: Float[Tensor, "10"]
+    variances: Float[Tensor, "10"]
     explained: float
 
     @property
     def is_exposure(self) -> bool:
         """True for Rec. 601's weights without vignetting."""
-        return self.numbers[:3].tolist() == list(REC601) and not self.widths[-1]
+        return self.numbers[:3].tolist() == list(REC601) and not self.numbers[5:].any()
 
     def response(self) -> Response:
-        """Return the response that this is."""
-        gain, gamma = self.numbers[3:].exp().tolist()
-        shading = tuple(self.parameters[4:].tolist()) if self.widths[-1] else ()
+        """Return the response of these numbers."""
+        gain, gamma = self.numbers[3:5].exp().tolist()
+        shading = tuple(self.numbers[5:].tolist()) if self.numbers[5:].any() else ()
         return Response(self.numbers[:3], gain, gamma, shading=shading)
 
 
@@ -309,9 +306,9 @@ class _Groups(NamedTuple):
     """Means of points that are similar in colour and place.
 
     Attributes:
-        x: bands (3, p) of the points.
+        x: bands of the points.
         terms: `_shading_terms` of the points.
-        share: share of each point in its group's mean (n, p).
+        share: share of each point in its group's mean.
         y: mean alpha of each group.
         counts: number of points, wrong ones too.
         variance: variance of a group's points about a smooth function of colour and place.
@@ -327,10 +324,14 @@ class _Groups(NamedTuple):
     root: Float[Tensor, "n n"]
 
     @classmethod
-    def from_points(
-        cls, x: Float[Tensor, "3 p"], y: Float[Tensor, " p"], place: Float[Tensor, "2 p"]
-    ) -> _Groups:
-        """Group points about some of them; points that no smooth function explains count little."""
+    def from_points(cls, x: Tensor, y: Tensor, place: Tensor) -> _Groups:
+        """Group points about some of them; points that no smooth function explains count little.
+
+        Args:
+            x: bands (3, p) of beta.
+            y: alpha (p).
+            place: places (2, p) in beta, in its width and height from its middle.
+        """
         grey, terms = x.mean(0), _shading_terms(place.T)
         design = torch.cat([x, x * grey, terms * grey])
         start = torch.zeros_like(design[:, 0])
@@ -342,57 +343,47 @@ class _Groups(NamedTuple):
         ridge = 1e-6 * len(y) * torch.eye(len(design)).to(y)
         _, rest, weight = robust_least_squares(design, y, start, weigh, precision=ridge)
         points = torch.cat([x, place]).T / SETTINGS.near
-        nearest = torch.cdist(points, points[:: -(-len(y) // SETTINGS.groups)]).argmin(1)
-        member = one_hot(nearest).T.to(y)
+        member = one_hot(torch.cdist(points, points[:: -(-len(y) // SETTINGS.groups)]).argmin(1)).T.to(y)
         share = member * weight / (member @ weight)[:, None]
-        level, variance = share @ (y - rest).clamp(min=0.02), share @ rest.square()
-        alike, brighter = (
-            torch.exp(-torch.cdist(share @ points, share @ points).square() / 2),
-            (level / level.mean()).log(),
-        )
-        light = SETTINGS.light**2 * torch.outer(level, level) * (alike + torch.outer(brighter, brighter))
+        level, variance, centres = share @ (y - rest).clamp(min=0.02), share @ rest.square(), share @ points
+        brighter = (level / level.mean()).log()
+        alike = torch.exp(-torch.cdist(centres, centres).square() / 2) + torch.outer(brighter, brighter)
+        light = SETTINGS.light**2 * torch.outer(level, level) * alike
         root = torch.linalg.cholesky(light + (variance + SETTINGS.least**2).diag())
         return cls(x, terms, share, share @ y, member.sum(1), variance, root)
 
-    def seen(self, weights: Tensor, parameters: Float[Tensor, "9"]) -> Float[Tensor, "10 n"]:
-        """Return alpha by the parameters, and its derivatives."""
-        gamma = parameters[3].exp()
-        powers = gamma * (self.x.log() + parameters[4:] @ self.terms)
-        bands = (parameters[2] + powers).exp()
-        alpha = ((weights + HUES @ parameters[:2]) @ bands)[None]
-        bent = (weights + HUES @ parameters[:2]) @ (bands * powers)
-        return (
-            torch.cat([alpha, HUES.T @ bands, alpha, bent[None], gamma * alpha * self.terms]) @ self.share.T
-        )
+    def seen(self, numbers: Float[Tensor, "10"]) -> Float[Tensor, "11 n"]:
+        """Return alpha by the numbers of a response, and its derivatives by them."""
+        weights, gamma = numbers[:3], numbers[4].exp()
+        powers = gamma * (self.x.log() + numbers[5:] @ self.terms)
+        bands = (numbers[3] + powers).exp()
+        alpha, bent = weights @ torch.stack([bands, bands * powers])
+        seen = torch.cat([alpha[None], bands, alpha[None], bent[None], gamma * alpha * self.terms])
+        return seen @ self.share.T
 
-    def fitted(self, sensor: tuple[float, ...], deviations: tuple[float, ...]) -> _Fit:
-        """Fit the parameters of these prior deviations, added to a sensor's weights, by Gauss-Newton steps."""
-        weights, widths = self.y.new_tensor(sensor), self.y.new_tensor(deviations)
-        basis, scaled = widths.diag()[:, widths > 0], self.y.new_zeros(int((widths > 0).sum()))
-        prior = torch.eye(len(scaled)).to(widths)
-        if widths[2]:
-            scaled[(widths[:2] > 0).sum()] = (
-                self.y.median() / (self.share @ (weights @ self.x)).median()
-            ).log() / widths[2]
-        for left in range(SETTINGS.steps, -1, -1):
-            seen = self.seen(weights, basis @ scaled)
-            planes = torch.cat([self.y - seen[:1], basis.T @ seen[1:]])
-            rest, *rows = torch.linalg.solve_triangular(self.root, planes.T, upper=False).T
-            terms = torch.stack(rows) if rows else planes[1:]
-            if left:
-                scaled = least_squares(terms, rest + scaled @ terms, torch.ones_like(rest), prior)
+    def fitted(self, weights: tuple[float, ...], deviations: tuple[float, ...]) -> _Fit:
+        """Fit the free parameters of an explanation (one of `EXPLANATIONS`) by Gauss-Newton steps."""
+        mean = self.y.new_tensor((*weights, *[0] * 7))
+        change = torch.block_diag(HUES, torch.eye(7).to(HUES)) * mean.new_tensor(deviations)
+        scaled, prior, ones = mean.new_zeros(9), torch.eye(9).to(mean), torch.ones_like(self.y)
+        if deviations[2]:
+            scaled[2] = (self.y.median() / self.seen(mean)[0].median()).log() / deviations[2]
+        for _ in range(SETTINGS.steps):
+            seen = self.seen(mean + change @ scaled)
+            off = self.y - seen[0]
+            planes = torch.cat([off[None], change.T @ seen[1:]])
+            rest, terms = torch.linalg.solve_triangular(self.root, planes.T, upper=False).T.split([1, 9])
+            wanted = rest[0] + scaled @ terms
+            scaled = least_squares(terms, wanted, ones, prior)
         information = prior + terms @ terms.T
-        misfit = rest.square().sum() + scaled.square().sum() + torch.logdet(information)
-        unusual = (sensor != REC601) + sum(deviations[i] > 0 for i in (2, 3, -1))
-        parameters = basis @ scaled
-        of_numbers = torch.block_diag(HUES, torch.eye(2).to(HUES))
-        numbers = torch.cat([weights, weights.new_zeros(2)]) + of_numbers @ parameters[:4]
-        half = of_numbers @ basis[:4]
-        variances = (half @ torch.linalg.inv(information) @ half.T).diagonal()
+        squares = (wanted - scaled @ terms).square().sum() + scaled.square().sum()
+        unusual = (weights != REC601) + sum(deviations[i] > 0 for i in (2, 3, -1))
+        evidence = unusual * math.log(SETTINGS.rare) - (squares + torch.logdet(information)) / 2
+        variances = (change @ torch.linalg.inv(information) @ change.T).diagonal()
+        # A group of none but unlikely matches is a material that alpha sees otherwise: it counts in full.
         unlike = self.y - self.counts @ self.y / self.counts.sum()
-        left, whole = (float(self.counts @ (r.square() + self.variance)) for r in (planes[0], unlike))
-        evidence = unusual * math.log(SETTINGS.rare) - misfit / 2
-        return _Fit(evidence, widths, parameters, numbers, variances, max(1 - left / whole, 0.0))
+        left, whole = (float(self.counts @ (r.square() + self.variance)) for r in (off, unlike))
+        return _Fit(evidence, mean + change @ scaled, variances, max(1 - left / whole, 0.0))
 
 
 class SpectralMix(NamedTuple):

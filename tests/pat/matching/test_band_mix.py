@@ -78,7 +78,8 @@ def test_a_sensor_without_filters_is_preferred_to_weights_that_explain_alpha_har
     alpha = light * x.mean(0) + noise
     assert fit(x, alpha).weights.tolist() == [1 / 3] * 3
     with monkeypatch.context() as patched:
-        patched.setattr(band_mix, "EXPLANATIONS", [one for one in EXPLANATIONS if one[0] == REC601 or one[1][0]])
+        others = [one for one in EXPLANATIONS if one[0] == REC601 or one[1][0]]
+        patched.setattr(band_mix, "EXPLANATIONS", others)
         assert (fit(x, alpha).weights - 1 / 3).abs().max() > 0.01
     other = fit(x, combined(x[:, :, None], WEIGHTS)[0, :, 0] * light + noise).weights
     assert (other - torch.tensor(WEIGHTS)).abs().max() < 0.06
