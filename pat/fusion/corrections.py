@@ -1,7 +1,7 @@
 """Errors of cameras and rig, estimated once a frame from a fusion of reduced images.
 
 A pre-pass matches the images at half the size or less, without a network. Where its matches are reliable,
-alpha's response is fitted (`pat.matching.radiometry`), and beta's distance across its search segments
+alpha's response is fitted (`pat.matching.band_mix`), and beta's distance across its search segments
 (`pat.matching.epipolar_offset`). Both are corrected before the frame is fused.
 """
 
@@ -173,6 +173,7 @@ def find_corrections(
         response_now = corrections.response
         if rgb:
             found = _fitted(small, matches)
+            LOG.info("%s; %.0f %% of its variance is explained", found, 100 * found.explained)
             response_now = found if fits else response_now._replace(explained=found.explained)
         steps = [fit_misalignment(*m[2:]) if align else Misalignment() for m in matches]
         moves = zip(inputs.cameras, corrections.of_betas(inputs), steps)

@@ -127,14 +127,15 @@ class Response(NamedTuple):
         return self.explains and bool(other < off / 3)
 
     def __str__(self) -> str:
-        sure = [f"±{deviation:.2f}" if any(self.deviations) else "" for deviation in self.deviations]
-        red, green, blue = (
-            f"{weight:.2f}{off} {band}" for weight, off, band in zip(self.weights.tolist(), sure, "RGB")
-        )
-        gain = "" if self.gain == 1 else f" x {self.gain:.2f}"
-        gamma = "" if self.gamma == 1 else f" of beta to the power {self.gamma:.2f}"
+        red, green, blue = self.weights.tolist()
+        gain = "" if self.gain == 1 else f" x {self.gain:.2f}{self._sure(self.gain * self.deviations[3])}"
+        gamma = f" of beta to the power {self.gamma:.2f}{self._sure(self.gamma * self.deviations[4])}"
         shading = ", of beta freed of vignetting" if self.shading else ""
-        return f"alpha is {red} + {green} + {blue}{gain}{gamma}{shading}"
+        weights = f"{red:.2f} R + {green:.2f} G + {blue:.2f} B{self._sure(*self.deviations[:3])}"
+        return f"alpha is {weights}{gain}{gamma if self.gamma != 1 else ''}{shading}"
+
+    def _sure(self, *deviations: float) -> str:
+        return f" (± {', '.join(f'{d:.2f}' for d in deviations)})" if any(self.deviations) else ""
 
     def of_alpha(self, alpha: Float[Tensor, "*b 1 h w"]) -> Float[Tensor, "*b 1 h w"]:
         """Return alpha on the scale of `of_beta`'s luma."""
