@@ -55,7 +55,7 @@ class BandMixSettings:
     )
     least: float = tuned(0.005, "Middlebury: standard deviation of a group of points, at least")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
-    groups: int = size(256, "Groups of alike points; half or twice as many do as well")
+    groups: int = size(256, "Groups of alike points; half as many cost .1 dB at most, on average")
     outlier: float = physics(2.385, "Deviations that count half: 95 % efficient if errors are normal")
     steps: int = size(3, "Gauss-Newton steps of an explanation")
     explained: float = tuned(
@@ -63,8 +63,8 @@ class BandMixSettings:
         "Share of alpha's variance that must be explained: of Middlebury's tune half at least .88 is, "
         "of near infrared at most .73",
     )
-    equal: float = size(
-        1e-4, "Share of the bands' mean variance by which a linear mix is drawn to equal parts"
+    ridge: float = size(
+        1e-4, "Share of the bands' mean variance by which bands that are alike get equal weights"
     )
     coarsely: int = size(400_000, "Alpha's pixels at most on which a linear mix is found")
     wide: int = size(4, "The image's longer side over the radius in which bands are compared")
@@ -458,15 +458,15 @@ def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
     weight = weight + 1e-6
     x, (y,) = (_beyond_local_mean(planes, weight).flatten(1) for planes in (bands[order], alpha))
     share = (weight / weight.sum()).flatten()
-    scale = (share @ y.square()).sqrt() / (share @ x.mean(0).square()).sqrt().clamp(min=1e-3)
-    equal = scale.expand(len(x)) / len(x)
-    precision = (SETTINGS.equal * (share @ x.square().mean(0)) + 1e-12) * torch.eye(len(x)).to(x)
-    beyond = y - equal @ x
-    start = least_squares(x, beyond, share, precision)
-    beyond_equal, rest, robust = robust_least_squares(
-        x, beyond, start, lambda rest: share * gaussian(rest, UNLIKE), precision=precision, steps=1
+    precision = (SETTINGS.ridge * (share @ x.square().mean(0)) + 1e-12) * torch.eye(len(x)).to(x)
+    weights, rest, robust = robust_least_squares(
+        x,
+        y,
+        least_squares(x, y, share, precision),
+        lambda rest: share * gaussian(rest, UNLIKE),
+        precision=precision,
+        steps=1,
     )
-    weights = equal + beyond_equal
     explained = (1 - share @ rest.square() / (share @ y.square()).clamp(min=1e-12)).clamp(min=0)
     # What pixels have beyond the mean of those around: how materials differ does not count.
     detail = (bands[order] - box_mean(bands[order], 1)).flatten(1)
