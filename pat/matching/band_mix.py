@@ -345,7 +345,7 @@ class _Groups(NamedTuple):
         _, rest, weight = robust_least_squares(design, y, start, weigh, precision=ridge)
         points = torch.cat([x, place]).T / SETTINGS.near
         member = one_hot(torch.cdist(points, points[:: -(-len(y) // SETTINGS.groups)]).argmin(1)).T.to(y)
-        share = member * weight / (member @ weight)[:, None]
+        share = (member * weight / (member @ weight)[:, None]).to_sparse()
         level, variance, centres = share @ (y - rest).clamp(min=0.02), share @ rest.square(), share @ points
         brighter = (level / level.mean()).log()
         alike = torch.exp(-torch.cdist(centres, centres).square() / 2) + torch.outer(brighter, brighter)
@@ -360,7 +360,7 @@ class _Groups(NamedTuple):
         bands = (numbers[3] + powers).exp()
         alpha, bent = weights @ torch.stack([bands, bands * powers])
         seen = torch.cat([alpha[None], bands, alpha[None], bent[None], gamma * alpha * self.terms])
-        return seen @ self.share.T
+        return (self.share @ seen.T).T
 
     def fitted(self, weights: tuple[float, ...], deviations: tuple[float, ...]) -> _Fit:
         """Fit the free parameters of an explanation (one of `EXPLANATIONS`) by Gauss-Newton steps."""
