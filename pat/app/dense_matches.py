@@ -22,9 +22,9 @@ from ..fusion.inputs import prepared
 from ..fusion.steps import steps_for, undone
 from ..fusion.tiles import fused_in_tiles
 from ..fusion.views import Views
+from ..matching.band_mix import Response
 from ..matching.inputs import Extent, Inputs, Matches, match_positions
 from ..matching.match import match
-from ..matching.radiometry import Response
 from ..media.images import Images
 from ..networks.protocol import FusionOutput, JoinsBands, required
 from ..support.blocks import without_autocast

@@ -1,7 +1,7 @@
 """Errors of cameras and rig, estimated once a frame from a fusion of reduced images.
 
 A pre-pass matches the images at half the size or less, without a network. Where its matches are reliable,
-alpha's response is fitted (`pat.matching.radiometry`), and beta's distance across its search segments
+alpha's response is fitted (`pat.matching.band_mix`), and beta's distance across its search segments
 (`pat.fusion.epipolar_offset`). Both are corrected before the frame is fused.
 """
 
@@ -23,6 +23,7 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import sample
 
+from ..matching.band_mix import Response, ResponseSpec, fit, given_response
 from ..matching.inputs import (
     CONSISTENT,
     Beta,
@@ -36,7 +37,6 @@ from ..matching.inputs import (
 from ..matching.match import located
 from ..matching.normalisation import SETTINGS as NORMALISATION
 from ..matching.normalisation import Normalisation, moments
-from ..matching.radiometry import Response, ResponseSpec, fit, given_response
 from ..media.filters import blurred
 from ..networks.protocol import FusionNetwork
 from ..support.settings import size, tuned
@@ -179,6 +179,7 @@ def find_corrections(
         response_now = corrections.response
         if rgb:
             found = _fitted(small, matches)
+            LOG.info("%s; %.0f %% of its variance is explained", found, 100 * found.explained)
             response_now = found if fits else response_now._replace(explained=found.explained)
         steps = [fit_misalignment(*m[2:]) if align else Misalignment() for m in matches]
         moves = zip(inputs.cameras, corrections.of_betas(inputs), steps)

@@ -18,9 +18,9 @@ from arraygeom.runtime.threads import torch_in_one_thread
 from arraygeom.runtime.tracing import transformations
 from arraygeom.runtime.warned import warn
 
+from ..matching.band_mix import ResponseSpec, given_response
 from ..matching.inputs import Inputs, Matches
 from ..matching.match import Matcher, match
-from ..matching.radiometry import ResponseSpec, given_response
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..support.blocks import without_autocast

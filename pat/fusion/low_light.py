@@ -19,7 +19,7 @@ from arraygeom.pixels import HW
 from arraygeom.runtime.chunks import chunked
 from arraygeom.runtime.warned import warn
 
-from ..matching.radiometry import Response
+from ..matching.band_mix import Response
 from ..networks.bm3d import Observation, other_camera_update, without_noise
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel, generator_for

@@ -25,8 +25,8 @@ from arraygeom import Moved, ReceptiveField, Rig, Widened
 from arraygeom.checks import check_above
 from arraygeom.fields.default import straight_field
 
+from ..matching.band_mix import Response
 from ..matching.normalisation import UNLIKE, Moments, mean_moments
-from ..matching.radiometry import Response
 from ..networks.protocol import FusionNetwork
 from ..sensors import NoiseLevel
 from ..support.settings import physics, size

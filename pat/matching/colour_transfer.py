@@ -24,11 +24,11 @@ from ..media.colour import REC601, to_bytes
 from ..media.filters import LocalMoments, box_mean, numpy_of, smoothed
 from ..support.neighbours import nearest_points
 from ..support.settings import size, tuned
+from .band_mix import SpectralMix
 from .inputs import Beta, BetaMatches, Colours, Inputs, Matches, at_matches, is_consistent
 from .normalisation import SETTINGS as NORMALISATION
 from .normalisation import Moments, explained_share, likeness, moments
 from .semi_global import DISPARITY_FILL
-from .spectral_mix import SpectralMix
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ from arraygeom.sampling import on_image, sample
 
 from ..media.colour import luminance
 from ..support.settings import size, tuned
+from .band_mix import SpectralMix
 from .normalisation import ComparedViews, Normalisation
-from .spectral_mix import SpectralMix
 
 
 @dataclass(frozen=True)

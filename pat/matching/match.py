@@ -13,13 +13,13 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
 
+from .band_mix import SETTINGS as MIX
+from .band_mix import SpectralMix
 from .choice import Choice, chosen, with_certainty
 from .colour_transfer import transferred
 from .inputs import FINE, BetaMatches, Comparison, Inputs, Matches, at_matches, is_consistent, reduced
 from .multiview import agreed, with_likeliest_colours
 from .semi_global import HalfSizeMatches, matched_at_half_size
-from .spectral_mix import SETTINGS as MIX
-from .spectral_mix import SpectralMix
 from .subpixel import following, matched_at_full_size
 
 LOG = logging.getLogger(__name__)

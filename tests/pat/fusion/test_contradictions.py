@@ -14,7 +14,7 @@ from pat.app.cli.options import response_of
 from pat.app.sample_array import SAMPLE
 from pat.fusion.corrections import Corrections
 from pat.fusion.views import ViewFiles, Views, read_view
-from pat.matching.radiometry import Response
+from pat.matching.band_mix import Response
 from pat.media.images import write_image
 from pat.networks.weights import load_weights
 

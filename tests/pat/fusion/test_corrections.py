@@ -15,8 +15,8 @@ from pat.fusion.fuse import corrections_of
 from pat.fusion.inputs import clipped_in, prepared
 from pat.fusion.sequence import SequenceFusion
 from pat.fusion.views import Views
+from pat.matching.band_mix import Response
 from pat.matching.colour_transfer import with_clipped_light
-from pat.matching.radiometry import Response
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
 from pat.support.metrics import score

@@ -29,8 +29,8 @@ from pat.fusion.low_light import (
 )
 from pat.fusion.tiles import Tile, fuse_tile
 from pat.fusion.views import Views
+from pat.matching.band_mix import Response
 from pat.matching.inputs import Beta, Inputs
-from pat.matching.radiometry import Response
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionOutput
 from pat.networks.weights import load_weights

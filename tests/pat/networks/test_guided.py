@@ -19,7 +19,7 @@ from pat.networks.guided import GuidedPAT
 from pat.networks.protocol import fused_at_once, matched_for
 from pat.networks.weights import load_weights
 from tests.arraygeom.rigs import parallel_rig
-from tests.pat.matching.test_spectral_mix import texture
+from tests.pat.matching.test_band_mix import texture
 
 HW = (32, 48)
 

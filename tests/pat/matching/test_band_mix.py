@@ -1,19 +1,26 @@
-"""Alpha's response: stated or fitted, applied to beta, and taken back from the result."""
+"""Mix of bands that alpha sees: a response, stated or fitted, applied and undone; a mix of any bands."""
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from pat.matching.filters import box_mean
+from torch.nn.functional import interpolate
 
+from arraygeom import Pair, Rectified, View
+from arraygeom.fields.grid import FieldOnGrid
 from pat import FuseSettings, fuse
-from pat.matching import radiometry
-from pat.matching.radiometry import SETTINGS, UNLIKE, Response, fit, stated_response
+from pat.matching import band_mix
+from pat.matching.band_mix import EXPLANATIONS, SETTINGS, Response, SpectralMix, fit, stated_response
+from pat.matching.match import coarse_mix
 from pat.media.colour import REC601, luminance
 from pat.networks.weights import load_weights
 from pat.support.metrics import score
 from tests.pat.layered_array import ALPHA, BETA, load_sample
 
 WEIGHTS = (0.2, 0.4, 0.4)
+SPECTRAL_WEIGHTS = torch.tensor([0.3, 0.6, 0.1])
 
 
 def combined(image, weights=WEIGHTS):
@@ -78,13 +85,40 @@ def test_a_sensor_without_filters_is_preferred_to_weights_that_explain_alpha_har
     alpha = light * x.mean(0) + noise
     assert fit(x, alpha).weights.tolist() == [1 / 3] * 3
     with monkeypatch.context() as patched:
-        patched.setattr(radiometry, "UNLIKE", [kind for kind in UNLIKE if kind.weights[0] != 1 / 3])
+        others = [one for one in EXPLANATIONS if one[0] == REC601 or one[1][0]]
+        patched.setattr(band_mix, "EXPLANATIONS", others)
         assert (fit(x, alpha).weights - 1 / 3).abs().max() > 0.01
     other = fit(x, combined(x[:, :, None], WEIGHTS)[0, :, 0] * light + noise).weights
     assert (other - torch.tensor(WEIGHTS)).abs().max() < 0.06
     gain = fit(x, 0.6 * alpha)
     assert gain.weights.tolist() == [1 / 3] * 3
     assert gain.gain == pytest.approx(0.6, rel=0.02)
+
+
+def test_the_stated_deviations_are_those_of_the_errors():
+    """Twelve materials, each lit a little otherwise in one camera, as much as the prior says."""
+    off = []
+    for seed in range(12):
+        g = torch.Generator().manual_seed(seed)
+        material = torch.randint(12, (3000,), generator=g)
+        colours = 0.5 + 0.3 * (2 * torch.rand(3, 12, generator=g)[:, material] - 1)
+        truth = colours * (0.7 + 0.6 * torch.rand(3000, generator=g))
+        light = 1 + SETTINGS.light * torch.randn(12, generator=g)[material]
+        alpha = combined(truth[:, :, None], WEIGHTS)[0, :, 0] + 0.005 * torch.randn(3000, generator=g)
+        found = fit(light * truth, alpha)
+        off.append(
+            ((found.weights - torch.tensor(WEIGHTS)) / torch.tensor(found.deviations[:3])).square().mean()
+        )
+    assert 0.5 < float(torch.stack(off).mean().sqrt()) < 1.7
+
+
+def test_what_is_not_fitted_has_no_deviation_and_a_fit_says_its():
+    g = torch.Generator().manual_seed(0)
+    x = torch.rand(3, 4000, generator=g) * 0.8 + 0.1
+    assert str(stated_response(WEIGHTS)) == "alpha is 0.20 R + 0.40 G + 0.40 B"
+    found = fit(0.5 * x, combined(x[:, :, None], WEIGHTS)[0, :, 0] + 0.01 * torch.randn(4000, generator=g))
+    assert all(0 < deviation < 0.02 for deviation in found.deviations[:4])
+    assert str(found).endswith(f" (± {found.gain * found.deviations[3]:.2f})")
 
 
 def points_of_one_hue():
@@ -172,7 +206,7 @@ def test_leaves_lit_more_brightly_are_not_taken_for_a_sensor_of_green_alone(monk
     )
     alpha = luminance(x[:, None])[0, 0] * light[material] + 0.005 * torch.randn(4000, generator=g)
     assert fit(x, alpha).is_rec601
-    monkeypatch.setattr(radiometry, "SETTINGS", replace(SETTINGS, light=0.001))
+    monkeypatch.setattr(band_mix, "SETTINGS", replace(SETTINGS, light=0.001))
     assert fit(x, alpha).weights[1] > 0.65
 
 
@@ -185,7 +219,7 @@ def test_a_band_that_no_combination_explains_leaves_rec601(monkeypatch):
     x, alpha = colours[:, material] * shadow, (colours.mean(0) + other)[material] / 2 * shadow
     assert fit(x, alpha).is_rec601
     assert not fit(x, alpha).explains
-    monkeypatch.setattr(radiometry, "SETTINGS", replace(SETTINGS, explained=0.5))
+    monkeypatch.setattr(band_mix, "SETTINGS", replace(SETTINGS, explained=0.5))
     assert fit(x, alpha).explains
 
 
@@ -247,3 +281,87 @@ def test_a_share_of_matches_that_is_none_is_refused():
     for enough in (-1.0, 1.5, float("nan")):
         with pytest.raises(ValueError, match="enough"):
             fit(bands, bands[0], enough=enough)
+
+
+def texture(bands: int, hw: tuple[int, int], seed: int = 0) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    coarse, fine = (
+        torch.rand(1, bands, 8, 12, generator=g),
+        torch.rand(1, 1, hw[0] // 2, hw[1] // 2, generator=g),
+    )
+    parts = [interpolate(x, hw, mode="bicubic", align_corners=False) for x in (coarse, fine)]
+    return (0.7 * parts[0] + 0.3 * parts[1]).clamp(0, 1)
+
+
+def seen_in(bands: torch.Tensor) -> torch.Tensor:
+    return (SPECTRAL_WEIGHTS[None, :, None, None] * bands).sum(1, keepdim=True)
+
+
+def test_the_combination_is_that_of_least_squares_around_each_pixel():
+    """NumPy's, of what bands and alpha have beyond their means in squares of 33 pixels."""
+    bands = texture(3, (48, 64))
+    drift = torch.linspace(0, 0.2, 64).expand(1, 1, 48, 64)
+    alpha = (
+        seen_in(bands) + 0.05 + 0.01 * torch.randn(1, 1, 48, 64, generator=torch.Generator().manual_seed(1))
+    )
+    mix = SpectralMix.fitted(bands, alpha + drift, torch.ones_like(alpha))
+    local = [(p - box_mean(p, 16)).flatten(2)[0].double().numpy() for p in (bands, alpha + drift)]
+    expected = np.linalg.lstsq(local[0].T, local[1][0], rcond=None)[0]
+    assert (
+        np.abs(mix.weights[0].numpy() / np.sum(mix.weights[0].numpy()) - expected / expected.sum()).max()
+        < 0.01
+    )
+    assert abs(float(mix.weights.sum()) - 1) < 0.03
+    assert abs(float((mix.combined(bands) - alpha - drift).mean())) < 1e-3
+
+
+def test_slopes_are_those_of_detail_whatever_materials_do():
+    """Where the second band is bright the first is dark, both have the same pattern; the third has none."""
+    g = torch.Generator().manual_seed(0)
+    pattern, left = 0.2 * torch.rand(48, 64, generator=g), torch.zeros(48, 64)
+    left[:, :32] = 0.5
+    bands = torch.stack([pattern + left, 2 * pattern + 0.5 - left, torch.full_like(left, 0.3)])[None]
+    mix = SpectralMix.fitted(bands, bands.mean(1, keepdim=True), torch.ones(1, 1, 48, 64))
+    assert (mix.slopes[0] - torch.tensor([1.0, 2.0, 0.0])).abs().max() < 0.1
+
+
+def test_what_is_not_alpha_at_all_does_not_count():
+    bands = texture(3, (48, 64))
+    alpha = seen_in(bands)
+    alpha[..., :8] = 1.0
+    mix = SpectralMix.fitted(bands, alpha, torch.ones_like(alpha))
+    assert (mix.weights[0] - SPECTRAL_WEIGHTS).abs().max() < 0.05
+
+
+def test_alpha_corrects_bands_only_where_these_explain_it():
+    bands = texture(3, (48, 64))
+    alpha, other = seen_in(bands), texture(1, (48, 64), seed=5)
+    known, foreign = (SpectralMix.fitted(bands, a, torch.ones_like(a)) for a in (alpha, other))
+    assert float(known.gain) > 0.99
+    assert float(foreign.gain) < 0.01
+    wrong = bands + 0.05 * torch.randn(bands.shape, generator=torch.Generator().manual_seed(2))
+    better = known.reconciled(wrong, alpha)
+    assert (known.combined(better) - alpha).abs().max() < 2e-3
+    assert (better - bands).square().mean() < (wrong - bands).square().mean()
+    assert (foreign.reconciled(wrong, other) - wrong).abs().max() < 2e-3
+
+
+def test_the_order_of_bands_does_not_matter_to_the_last_bit():
+    bands, order = texture(4, (48, 64)), [2, 0, 3, 1]
+    alpha = bands[:, :2].mean(1, keepdim=True)
+    one, other = (SpectralMix.fitted(b, alpha, torch.ones_like(alpha)) for b in (bands, bands[:, order]))
+    assert torch.equal(other.weights, one.weights[:, order])
+    assert torch.equal(other.slopes, one.slopes[:, order])
+    assert torch.equal(other.combined(bands[:, order]), one.combined(bands))
+
+
+def test_the_combination_is_found_before_anything_is_matched():
+    """Beta sees the same 12 pixels to the left; equal parts would be far from what alpha sees."""
+    hw = (96, 160)
+    scene = texture(3, (hw[0], hw[1] + 12))
+    alpha, beta = seen_in(scene[..., :-12]), scene[..., 12:]
+    field = FieldOnGrid.from_field(Rectified(24.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))
+    segments, blocks = (field.of_blocks(side) for side in (2, 4))
+    mix = coarse_mix(alpha, beta, segments, blocks, 2)
+    assert (mix.weights[0] - SPECTRAL_WEIGHTS).abs().max() < 0.06
+    assert float(mix.gain) > 0.9
