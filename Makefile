@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme pairs stages conditions certainty without-rig alignment paper-network paper-tables outside fields trained-fields formats test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations gradients
+.PHONY: help env synthesis demo showcase readme pairs stages sensitivity conditions certainty without-rig alignment paper-network paper-tables outside fields trained-fields formats test test-long check format bench bench-job train notebooks docs drawings wheel fuzz mistakes kills transformations gradients
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -16,6 +16,7 @@ help:
 	@echo "make readme     run both and put what they print into docs/reports/demo.md and real_images.md"
 	@echo "make pairs      measure stereo pairs, ideal, into docs/reports/pairs.md; two minutes"
 	@echo "make stages     measure each stage of the fusion left out, on the tune half, into docs/reports/stages.md; half an hour"
+	@echo "make sensitivity  halve and double each tuned number, on the tune half, into docs/reports/stages.md; half an hour"
 	@echo "make conditions measure other responses, low light and misalignment into docs/reports/conditions.md; half an hour"
 	@echo "make certainty  measure how well stated confidence holds into docs/reports/confidence.md; ten minutes"
 	@echo "make alignment  measure how well bands are aligned into docs/reports/alignment.md; ten minutes"
@@ -70,6 +71,10 @@ pairs: $(READY)
 stages: $(READY)
 	@$(BIN)/python -m experiments stages --middlebury $(DATA)/middlebury --out out/stages
 	@$(BIN)/python -m docs.update_readme --document docs/reports/stages.md --block stages=out/stages/stages.md
+
+sensitivity: $(READY)
+	@$(BIN)/python -m experiments sensitivity --middlebury $(DATA)/middlebury --out out/sensitivity
+	@$(BIN)/python -m docs.update_readme --document docs/reports/stages.md --block sensitivity=out/sensitivity/sensitivity.md
 
 conditions: $(READY)
 	@$(BIN)/python -m experiments conditions --middlebury $(DATA)/middlebury --half report --out out/conditions

@@ -145,6 +145,7 @@ class Experiments:
         "conditions": commands.Conditions,
         "outside": commands.Outside,
         "stages": commands.Stages,
+        "sensitivity": commands.Sensitivity,
         "gradients": commands.Gradients,
         "certainty": commands.Certainty,
         "sweeps": commands.Sweeps,

@@ -25,7 +25,7 @@ from pat.networks.protocol import Comparing, FusionNetwork
 from pat.networks.weights import Network, load_weights
 from pat.support.tensor_files import write_tensors
 
-from . import certainty, conditions, fields, gradients, paper, stages, sweeps, trained_fields
+from . import certainty, conditions, fields, gradients, paper, sensitivity, stages, sweeps, trained_fields
 from .halves import of_half
 from .outside import evaluate_outside, outside_markdown
 from .sweep_report import write_report
@@ -145,6 +145,25 @@ class Stages(Pairs):
         refuse_unknown("--only: no condition", self.only, stages.STAGE_CONDITIONS)
         scores = stages.score_stages(self.pairs(), self.only)
         finished(self.out / "stages.md", stages.stages_markdown(scores))
+
+
+@dataclass
+class Sensitivity:
+    """Fuse stereo pairs of the tune half with each tuned number halved and doubled; half an hour.
+
+    Example: python -m experiments sensitivity --middlebury data/middlebury
+    """
+
+    middlebury: Path
+    """Folder of Middlebury's pairs."""
+    out: Out = Path("out/sensitivity")
+    """Folder for sensitivity.md."""
+
+    def run(self) -> None:
+        """Write and print the table. Raises RuntimeError for a fusion that fails."""
+        entries = sensitivity.tuned_entries()
+        rows = progress("changing")(sensitivity.measured(self.middlebury, entries), len(entries))
+        finished(self.out / "sensitivity.md", sensitivity.sensitivity_markdown(rows))
 
 
 @dataclass

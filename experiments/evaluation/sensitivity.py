@@ -28,6 +28,7 @@ PAIRS = ("Bowling1", "Cloth4", "Flowerpots", "Midd1")
 """Ends of the names of the pairs that are fused, of the tune half."""
 LOW_LIGHT, CORRECTIONS = ("200 electrons",), ("rows off 3 px", "alpha = .2/.4/.4")
 STATES = {
+    "ColourTransferSettings": ("x2", "x4", "alpha = .2/.4/.4", "4000 electrons, not stated"),
     "BM3DSettings": LOW_LIGHT,
     "NonLocalMeansSettings": LOW_LIGHT,
     "LowLightSettings": LOW_LIGHT,
@@ -129,8 +130,8 @@ def sensitivity_markdown(rows: Iterable[tuple[SettingEntry, Sequence[Change]]]) 
             name = max(change.psnr, key=lambda name: abs(change.psnr[name]))
             depth = max(change.within.values(), key=abs)
             cells.append(f"{change.psnr[name]:+.2f} ({name}) / {depth:+.1%}")
-        lines.append([f"{entry.algorithm}.{entry.name} = {entry.value}", *cells])
-    heads = [f"times {factor:g}: PSNR, dB, where it changes most / depth" for factor in FACTORS]
+        lines.append([f"{entry.algorithm.removesuffix('Settings')}.{entry.name} = {entry.value}", *cells])
+    heads = [f"times {factor:g}" for factor in FACTORS]
     return markdown_table(["setting", *heads], lines)
 
 
