@@ -29,7 +29,7 @@ PAIRS = ("Bowling1", "Cloth4", "Flowerpots", "Midd1")
 LOW_LIGHT, CORRECTIONS = ("200 electrons",), ("rows off 3 px", "alpha = .2/.4/.4")
 STATES = {
     "ColourTransferSettings": ("x2", "x4", "alpha = .2/.4/.4", "4000 electrons, not stated"),
-    "BM3DSettings": LOW_LIGHT,
+    "BM3DSettings": (*LOW_LIGHT, "50 electrons, of alpha alone"),
     "NonLocalMeansSettings": LOW_LIGHT,
     "LowLightSettings": LOW_LIGHT,
     "AlignmentSettings": CORRECTIONS,
