@@ -37,22 +37,26 @@ STATES = {
 }
 """Conditions of `stages.STAGE_CONDITIONS` in which they are, by algorithm; others by `USUAL`."""
 USUAL = ("x2", "alpha = .2/.4/.4")
+SAID = "half or twice as much does as well"
+"""End of the reason of a number that matters little."""
 COMPILED_IN = ("CensusSettings", "BM3DSettings")
 """Algorithms whose loops have settings compiled into them."""
 FACTORS = (0.5, 2.0)
 WORKER = """
 import sys
+from functools import partial
 from pat.support import settings
 middlebury, why, factor, *states = sys.argv[1:]
-tuned, met = settings.tuned, []
+made, met = {kind: getattr(settings, kind) for kind in ("tuned", "size")}, []
 def changed(value):
     if isinstance(value, tuple):
         return tuple(map(changed, value))
     return max(round(value * float(factor)), 1) if isinstance(value, int) else value * float(factor)
-def changing(value, reason):
+def changing(kind, value, reason):
     met.append(reason)
-    return tuned(changed(value) if reason == why else value, reason)
-settings.tuned = changing
+    return made[kind](changed(value) if reason == why else value, reason)
+for kind in made:
+    setattr(settings, kind, partial(changing, kind))
 from experiments.evaluation.sensitivity import print_scores
 assert met.count(why) == bool(why), met
 print_scores(middlebury, states)
@@ -117,8 +121,9 @@ def measured(
 
 
 def tuned_entries() -> list[SettingEntry]:
-    """The settings of the fusion that were tuned."""
-    return [entry for entry in all_settings(*ROOMS) if entry.kind == "tuned"]
+    """The settings of the fusion that were tuned, and those that are said to matter little (`SAID`)."""
+    entries = all_settings(*ROOMS)
+    return [entry for entry in entries if entry.kind == "tuned" or entry.why.lower().endswith(SAID)]
 
 
 def sensitivity_markdown(rows: Iterable[tuple[SettingEntry, Sequence[Change]]]) -> str:

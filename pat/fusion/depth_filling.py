@@ -18,7 +18,7 @@ from arraygeom.runtime.chunks import chunked
 from ..matching.inputs import FINE
 from ..matching.subpixel import Plane, Planes, repeated
 from ..media.filters import nearest_known, numpy_of
-from ..support.settings import physics, tuned
+from ..support.settings import physics, size, tuned
 from .frame import Frame
 from .inputs import FrameInputs, Placement
 
@@ -34,15 +34,15 @@ class FillSettings:
         0.4,
         "Middlebury, tune half, of .2 to .7: share of the confidence around, below which a plane is taken",
     )
-    reach: float = tuned(
+    reach: float = size(
         80.0,
-        "Middlebury, tune half: pixels to which matches count where alpha is even and depth has no step. "
-        "A change of alpha from black to white is as far",
+        "Pixels to which matches count where alpha is even and depth has no step. "
+        "A change of alpha from black to white is as far. Half or twice as much does as well",
     )
-    step: float = tuned(
+    step: float = size(
         2.0,
-        "Middlebury, tune half, of 1.5 to 10: change of inverse depth that is as far as `reach` when planes "
-        "are first fitted, in half-widths of its interval: its width",
+        "Change of inverse depth that is as far as `reach` when planes "
+        "are first fitted, in half-widths of its interval: its width; half or twice as much does as well",
     )
     one_side: float = physics(
         0.9, "Length of the segments' sum over the sum of their lengths, from which betas are on one side"

@@ -47,7 +47,9 @@ class ColourTransferSettings:
     fill: float = tuned(
         100.0, "Middlebury, tune half: strength of colour's diffusion, which stops where disparity's does"
     )
-    surroundings: int = tuned(48, "Middlebury: pixels within which both views' brightness is compared")
+    surroundings: int = size(
+        48, "Pixels within which both views' brightness is compared; half or twice as much does as well"
+    )
     saturation: float = tuned(0.6, "Middlebury: the power of its ratio by which colour grows")
     most_brighter: float = size(2.0, "Surroundings that differ by a larger factor are of different things")
     detail_radius: int = tuned(
@@ -56,7 +58,9 @@ class ColourTransferSettings:
         "that beta lost; in standard deviations of the blur by which beta is less sharp than alpha, where "
         "that is more: within a smaller window beta shows one value",
     )
-    floor: float = tuned(1e-4, "Middlebury: regulariser of regressions on brightness, a variance of that")
+    floor: float = size(
+        1e-4, "Variance that regularises regressions on brightness; half or twice as much does as well"
+    )
     noise_share: float = tuned(
         20.0,
         "SYNTIM and Middlebury: variance of noise in all bands over that of the difference in brightness",

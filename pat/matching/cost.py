@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from arraygeom.runtime.compiled import compiled
 
-from ..support.settings import physics, tuned
+from ..support.settings import physics, size, tuned
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class CensusSettings:
     `pat lab settings` prints the value of each with its meaning and reason.
     """
 
-    brightness: float = tuned(30.0, "Source not recorded: what a difference of 1 in brightness costs")
-    truncated: float = tuned(20.0, "Source not recorded: what brightness costs at most")
+    brightness: float = tuned(30.0, "Middlebury, tune half: what a difference of 1 in brightness costs")
+    truncated: float = size(20.0, "What brightness costs at most; half or twice as much does as well")
     unseen: int = physics(24, "About half of the bits: a label beyond beta's edge, where the point may be")
     nowhere: int = physics(80, "More than any other cost: of a label that is not on beta")
 

@@ -41,7 +41,7 @@ class InputsSettings:
     at_once: int = size(1_200_000, "Pixels of alpha matched at once")
     consistent: float = tuned(
         0.2,
-        "Source not recorded: matching back from beta ends less than this (times 8 pixels) from the match",
+        "Middlebury, tune half: matching back from beta ends less than this (times 8 pixels) from the match",
     )
 
 

@@ -54,8 +54,8 @@ class SemiGlobalSettings:
     `pat lab settings` prints the value of each with its meaning and reason.
     """
 
-    step: float = tuned(12.0, "Source not recorded: penalty of neighbours' labels that differ by one")
-    jump: float = tuned(100.0, "Source not recorded: of those that differ by more, where alpha has no edge")
+    step: float = tuned(12.0, "Middlebury, tune half: penalty of neighbours' labels that differ by one")
+    jump: float = tuned(100.0, "Middlebury, tune half: of those that differ by more, where alpha has no edge")
     margin: int = size(64, "What is matched around a block, pixels")
     block: int = size(320, "Sides of a block, pixels")
     long_block: int = size(640, "The longer side of the blocks of large images, along the segments")
@@ -64,7 +64,7 @@ class SemiGlobalSettings:
     label_bytes: int = size(3, "What it takes for each label of each pixel: cost, and sum of costs")
     fill: tuple[float, float] = tuned(
         (50.0, 4.0),
-        "Source not recorded: strength, and 8-bit difference of an edge, of smoothing (Min et al. 2014)",
+        "Middlebury, tune half: strength, and 8-bit difference of an edge, of smoothing (Min et al. 2014)",
     )
 
 

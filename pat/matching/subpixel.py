@@ -46,21 +46,22 @@ class SubpixelSettings:
     same: float = tuned(0.7, "Middlebury: nearer matches at both sizes are of one surface, pixels")
     step_radius: int = size(2, "Window of the step to a fraction of a pixel, where both views are sharp")
     gradient_radius: int = size(6, "Window around a pixel whose brightness moves its match, in gradients")
-    most_step: float = tuned(0.25, "Middlebury, tune half: the most pixels of that step, there")
-    flat: float = tuned(
+    most_step: float = size(0.25, "The most pixels of that step, there; half or twice as much does as well")
+    flat: float = size(
         3e-6,
-        "Middlebury: slope of brightness (its square) along the segment at which that step is half as long, "
-        "and a match weighs half in its surface; and across it, at which a displacement of beta counts half",
+        "Slope of brightness (its square) along the segment at which that step is half as long, "
+        "and a match weighs half in its surface; and across it, at which a displacement of beta counts half; "
+        "half or twice as much does as well",
     )
-    reach: float = tuned(
-        24.0, "Middlebury, tune half, of 16 to 32: pixels to which a surface's matches count"
-    )
+    reach: float = size(24.0, "Pixels to which a surface's matches count; half or twice as much does as well")
     edge: float = tuned(
         0.5, "Middlebury, tune half, of .5 to 1: change of disparity as far as `reach`, where views are sharp"
     )
     surfaces: int = size(2, "How often surfaces are fitted, the second time within the first ones")
-    level: float = tuned(
-        0.005, "Middlebury, tune half: variance of position, over reach^2, below which planes are level"
+    level: float = size(
+        0.005,
+        "Variance of position, over reach^2, below which planes are level; "
+        "half or twice as much does as well",
     )
 
 

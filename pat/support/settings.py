@@ -1,7 +1,8 @@
 """Settings of the algorithms: numbers in frozen dataclasses, each with its kind and its reason.
 
-*physics*: follows from a measurement or from the recording; *size*: amount of work at a time, without notable
-influence on results; *tuned*: chosen on images, which are named.
+*physics*: follows from a measurement or from the recording; *size*: amount of work at a time, or a number of
+which half or twice as much does as well; *tuned*: chosen on images, which are named. `make sensitivity`
+halves and doubles them.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def _entry(kind: Kind, value: Any, why: str) -> Any:
 physics = partial(_entry, "physics")
 """Field whose value follows from a measurement; `why` names it."""
 size = partial(_entry, "size")
-"""Field for the amount of work at a time."""
+"""Field for the amount of work at a time, or a number that hardly matters."""
 tuned = partial(_entry, "tuned")
 """Field whose value was tuned; `why` says on what, and what it does."""
 
