@@ -32,11 +32,15 @@ class SampleArray(NamedTuple):
     ground_truth: Float[Tensor, "3 h w"]
 
 
-def load_sample() -> SampleArray:
-    """Load the sample array, which lies in `SAMPLE`."""
-    rig = Rig.load(SAMPLE / "rig.yaml")
-    images = {name: read_image(SAMPLE / f"{name}.png") for name in rig.names}
-    return SampleArray(rig, {**images, ALPHA: luminance_of(images[ALPHA])}, read_image(SAMPLE / "truth.png"))
+def load_sample(folder: Path = SAMPLE) -> SampleArray:
+    """Load the sample array, or one from a folder with rig.yaml, truth.png and NAME.png of each camera.
+
+    Raises:
+        FileNotFoundError: for a missing file; ValueError for a damaged one.
+    """
+    rig = Rig.load(folder / "rig.yaml")
+    images = {name: read_image(folder / f"{name}.png") for name in rig.names}
+    return SampleArray(rig, {**images, ALPHA: luminance_of(images[ALPHA])}, read_image(folder / "truth.png"))
 
 
 def load_motorcycle() -> SampleArray:

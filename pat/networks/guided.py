@@ -54,7 +54,7 @@ class GuidedPAT(nn.Module):
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Return the bytes of memory to fuse so many pixels of alpha, beside the inputs."""
-        return alpha * (200.0 + 180.0 * max(len(betas) - 1, 0))
+        return alpha * (220.0 + 170.0 * max(len(betas) - 1, 0))
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W), sides multiples of 16, with the betas, by their matches.

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from pat.matching.filters import box_mean
 from torch.nn.functional import interpolate
 
 from arraygeom import Pair, Rectified, View
@@ -15,6 +14,7 @@ from pat.matching import band_mix
 from pat.matching.band_mix import EXPLANATIONS, SETTINGS, Response, SpectralMix, fit, stated_response
 from pat.matching.match import coarse_mix
 from pat.media.colour import REC601, luminance
+from pat.media.filters import box_mean
 from pat.networks.weights import load_weights
 from pat.support.metrics import score
 from tests.pat.layered_array import ALPHA, BETA, load_sample

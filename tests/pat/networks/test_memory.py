@@ -20,7 +20,7 @@ from tests.arraygeom.rigs import parallel_rig
 
 RESETS_PEAK = Path("/proc/self/clear_refs").exists()
 REPEATS = 2
-SIDE, TILE = 768, (192, 576, 192, 576)
+SIDE, TILE = 1536, (256, 1280, 256, 1280)
 
 
 def frame_of(side, betas):
