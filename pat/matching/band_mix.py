@@ -54,6 +54,9 @@ class BandMixSettings:
         0.2, "Middlebury: difference in colour, or in place in widths of beta, where light differs"
     )
     least: float = tuned(0.005, "Middlebury: standard deviation of a group of points, at least")
+    independent: float = tuned(
+        1.5, "Middlebury, tune half, of 1 to 3: a group counts as so many independent points"
+    )
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
     groups: int = size(256, "Groups of alike points; half as many cost .1 dB at most, on average")
     outlier: float = physics(2.385, "Deviations that count half: 95 % efficient if errors are normal")
@@ -350,7 +353,8 @@ class _Groups(NamedTuple):
         brighter = (level / level.mean()).log()
         alike = torch.exp(-torch.cdist(centres, centres).square() / 2) + torch.outer(brighter, brighter)
         light = SETTINGS.light**2 * torch.outer(level, level) * alike
-        root = torch.linalg.cholesky(light + (variance + SETTINGS.least**2).diag())
+        noise = (variance + SETTINGS.least**2) / SETTINGS.independent
+        root = torch.linalg.cholesky(light + noise.diag())
         return cls(x, terms, share, share @ y, member.sum(1), variance, root)
 
     def seen(self, numbers: Float[Tensor, "10"]) -> Float[Tensor, "11 n"]:
