@@ -43,7 +43,9 @@ class BandMixSettings:
     `pat lab settings` prints the value of each with its meaning and reason.
     """
 
-    prior: float = tuned(0.2, "Middlebury: standard deviation of weights about those of an unfiltered sensor")
+    prior: float = size(
+        0.2, "Standard deviation of weights about equal ones; half or twice as much does as well"
+    )
     exposure: float = physics(0.5, "Of the logarithms of gain and gamma: a stop, or 2.2, are .7 and .8")
     vignetting: float = physics(
         0.3, "Of the coefficients of its logarithm: cos^4 of 30 degrees in the corners is .6"

@@ -61,12 +61,15 @@ class ColourTransferSettings:
     floor: float = size(
         1e-4, "Variance that regularises regressions on brightness; half or twice as much does as well"
     )
-    noise_share: float = tuned(
+    noise_share: float = size(
         20.0,
-        "SYNTIM and Middlebury: variance of noise in all bands over that of the difference in brightness",
+        "Variance of noise in all bands over that of the difference in brightness; "
+        "half or twice as much does as well",
     )
     texture_share: float = tuned(0.6, "SYNTIM and Middlebury: texture's share that is taken off that")
-    lowest: float = tuned(0.1, "SYNTIM and Middlebury: the quantile that stands for the least of either")
+    lowest: float = size(
+        0.1, "The quantile that stands for the least of either; half or twice as much does as well"
+    )
     least_noise: float = size(
         2e-5, "Variance not worth the time to take it out: two thirds of a level of 8 bits in each band"
     )

@@ -43,7 +43,9 @@ class SubpixelSettings:
 
     run: int = size(5, "Labels in a run, of which each pixel has two")
     neighbourhood: int = size(5, "Side of the neighbourhood at half the size, pixels")
-    same: float = tuned(0.7, "Middlebury: nearer matches at both sizes are of one surface, pixels")
+    same: float = size(
+        0.7, "Nearer matches at both sizes are of one surface, pixels; half or twice as much does as well"
+    )
     step_radius: int = size(2, "Window of the step to a fraction of a pixel, where both views are sharp")
     gradient_radius: int = size(6, "Window around a pixel whose brightness moves its match, in gradients")
     most_step: float = size(0.25, "The most pixels of that step, there; half or twice as much does as well")
