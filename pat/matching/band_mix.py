@@ -57,7 +57,7 @@ class BandMixSettings:
     )
     least: float = tuned(0.005, "Middlebury: standard deviation of a group of points, at least")
     independent: float = tuned(
-        1.5, "Middlebury, tune half, of 1 to 3: a group counts as so many independent points"
+        2.0, "Middlebury, tune half, of 1 to 3: a group counts as so many independent points"
     )
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
     groups: int = size(256, "Groups of alike points; half as many cost .1 dB at most, on average")

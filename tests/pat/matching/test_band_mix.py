@@ -48,7 +48,7 @@ def test_a_response_is_recovered_from_colourful_points(weights, gamma):
     alpha = 0.8 * (torch.tensor(weights)[:, None] * x**gamma).sum(0) + 0.01 * torch.randn(4000, generator=g)
     alpha[::20] = torch.rand(200, generator=g)  # wrong matches
     found = fit(x, alpha)
-    assert found.gamma == (gamma if gamma == 1 else pytest.approx(gamma, rel=0.03))
+    assert found.gamma == (gamma if gamma == 1 else pytest.approx(gamma, rel=0.035))
     assert found.gain == pytest.approx(0.8, abs=0.03)
     assert (found.weights - torch.tensor(weights)).abs().max() < 0.03
     assert found.is_rec601 is False
