@@ -1,4 +1,4 @@
-"""How much each tuned number matters: pairs fused with it halved and doubled."""
+"""Sensitivity of the fusion to each tuned number: pairs fused with it halved and doubled."""
 
 from __future__ import annotations
 

@@ -474,7 +474,7 @@ def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
         steps=1,
     )
     explained = (1 - share @ rest.square() / (share @ y.square()).clamp(min=1e-12)).clamp(min=0)
-    # What pixels have beyond the mean of those around: how materials differ does not count.
+    # Detail alone, pixels less the mean around them: differences between materials do not count.
     detail = (bands[order] - box_mean(bands[order], 1)).flatten(1)
     mixed = weights @ detail
     slopes = explained * (detail @ (robust * mixed)) / (robust @ mixed.square()).clamp(min=1e-12)
